@@ -1,0 +1,3 @@
+"""Identify flexible drive axes from motor current and encoder logs."""
+
+__version__ = "0.1.0"

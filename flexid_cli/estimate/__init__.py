@@ -1,0 +1,1 @@
+"""Least squares, covariance, identifiability: from columns to parameters with intervals."""

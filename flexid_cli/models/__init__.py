@@ -1,0 +1,1 @@
+"""Identification models: one model, one file; they see arrays, never files."""

@@ -1,0 +1,1 @@
+"""Zero-phase filters, derivatives, parallel decimation and their tuning."""

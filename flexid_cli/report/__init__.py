@@ -1,0 +1,1 @@
+"""The report: one document, one renderer a file; nothing is computed here."""

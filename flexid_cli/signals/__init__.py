@@ -1,0 +1,1 @@
+"""Signals and recordings: signal paths, units, sides, and the time base."""

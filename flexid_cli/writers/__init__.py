@@ -1,0 +1,1 @@
+"""Writers of logs: one container, one file."""
