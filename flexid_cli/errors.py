@@ -86,8 +86,18 @@ class ConfigError(FlexidError):
             text += f"  ({problem.path})"
         if problem.source_line:
             margin = " " * len(str(problem.line))
-            text += f"\n {problem.line} | {problem.source_line}"
-            text += f"\n {margin} | {' ' * (problem.column - 1)}^"
+            line, indent = _excerpt(problem.source_line, problem.column)
+            text += f"\n {problem.line} | {line}"
+            text += f"\n {margin} | {indent}^"
         if problem.hint:
             text += f"\n  hint: {problem.hint}"
         return text
+
+
+def _excerpt(line: str, column: int, width: int = 100) -> tuple[str, str]:
+    """Return the part of a long line around ``column``, and the white space that leads to that column."""
+    start = max(0, column - 1 - width // 2) if len(line) > width else 0
+    head, tail = "..." if start else "", "..." if start + width < len(line) else ""
+    before = line[start : column - 1]
+    indent = " " * len(head) + "".join("\t" if character == "\t" else " " for character in before)
+    return head + line[start : start + width] + tail, indent

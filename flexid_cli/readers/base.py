@@ -53,12 +53,16 @@ class RawChannel:
         a channel of its own.
     unit : str or None
         Unit that the log itself declares.
+    exact : ndarray of int64, shape (n,), or None
+        The same samples as integers, where all of them are integers and float64 cannot hold every one
+        (epoch nanoseconds in a column); else None.
     """
 
     source: str
     values: NDArray[np.float64]
     stamps: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
     unit: str | None = None
+    exact: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True)
@@ -82,8 +86,8 @@ class Reader(Protocol):
     """One log format.
 
     ``sniff`` must recognise its own files by content and reject every other reader's.
-    ``read`` raises InputError naming the nearest channels where a requested source does not exist, and where a
-    request is ambiguous.
+    ``read`` raises InputError naming the nearest channels where a requested source does not exist, and where
+    a request is ambiguous.
     """
 
     name: str

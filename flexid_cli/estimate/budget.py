@@ -1,0 +1,223 @@
+"""What else than random residuals can move an estimate: encoder noise, torque timing, reversal width.
+
+Each source is linearised about the solution. What it may move an estimate by joins the standard error, so that
+an interval does not stay narrow around a biased value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexid_cli.estimate.covariance import robust_covariance
+from flexid_cli.estimate.fit import FitResult
+from flexid_cli.models.base import Block, Model
+from flexid_cli.pipeline.columns import Columns
+from flexid_cli.signals.recording import Recording, Segment
+
+Array = NDArray[np.float64]
+
+# The encoders' noise floor is read where a drive's motion has died out: the upper part of the spectrum.
+NOISE_BAND = (0.6, 0.95)
+NOISE_SEED = 20010521
+SIGN_BAND_STEP = 0.7
+_NOISY_SIGNALS = frozenset({"torque", "motor", "joint", "torsion"})
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """White noise of each signal that would give the floor of its spectrum (one sigma a sample, SI)."""
+
+    torque: float
+    motor_position: float
+    joint_position: float
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """A neglected quantity, estimated beside the parameters.
+
+    Attributes
+    ----------
+    value, stderr : float
+        Its estimate, one Gauss-Newton step from the solution, and robust standard error.
+    shift : ndarray, shape (p,)
+        What the parameters would change by if it were part of the model.
+    """
+
+    value: float
+    stderr: float
+    shift: Array
+
+
+def noise_levels(recording: Recording) -> NoiseLevels:
+    """Noise of the signals from the upper part of their spectra."""
+    segment = max(recording.segments, key=lambda s: s.samples)
+    joint = 0.0 if segment.joint_position is None else _floor(segment.joint_position)
+    return NoiseLevels(_floor(segment.torque), _floor(segment.motor_position), joint)
+
+
+def _floor(x: Array) -> float:
+    """Standard deviation of white noise with the median density of the upper band."""
+    from scipy.signal import welch
+
+    length = min(1024, x.size)
+    # The second difference flattens the steep spectrum of a motion, whose leakage would hide the floor.
+    frequency, density = welch(np.diff(x, 2), fs=1.0, nperseg=length, window="hann")
+    gain = (2.0 * np.sin(np.pi * frequency)) ** 4
+    use = (frequency > 0.5 * NOISE_BAND[0]) & (frequency < 0.5 * NOISE_BAND[1])
+    return float(np.sqrt(np.median(density[use] / gain[use]) * 0.5))
+
+
+def noise_bias(model: Model, result: FitResult, columns: Columns, levels: NoiseLevels) -> Array:
+    """Shift of the estimates by noise in the columns (errors in variables), to second order in the noise.
+
+    A synthetic record of the signals' noise alone passes the same chain; its columns V add V'V to the normal
+    matrix, which moves the minimum by -H^-1 sum_k w_k^2 D_k' V_k' V_k a_k.
+
+    Returns
+    -------
+    ndarray, shape (p,)
+    """
+    noise = _noise_columns(columns, levels)
+    gradient = np.zeros(result.theta.size)
+    coefficients = model.coefficients(result.theta)
+    derivatives = model.jacobian(result.theta)
+    for block, w, a, D in zip(model.blocks, result.weights, coefficients, derivatives, strict=True):
+        V = _block_noise(block, noise)
+        gradient += w**2 * (V @ D).T @ (V @ a)
+    # (V D)'(V a) also holds the noise of the left side against itself, which is no error in variables only if
+    # the coefficient does not depend on the parameters: D is zero there, so nothing has to be taken out.
+    return -_solve_normal(result, gradient)
+
+
+def limited_torque_noise(
+    model: Model, result: FitResult, columns: Columns, levels: NoiseLevels
+) -> NoiseLevels:
+    """The levels with the torque's raised to what the residual allows.
+
+    Ripple and disturbances within the band are not seen in the floor of the spectrum; the residual bounds them:
+    at most all of it is torque noise, shaped by the torque's own columns.
+    """
+    unit = _noise_columns(columns, NoiseLevels(1.0, 0.0, 0.0))
+    shaped = _block_noise(model.blocks[0], unit) @ model.coefficients(result.theta)[0]
+    largest = result.sigmas[0] / max(float(np.std(shaped)), 1e-300)
+    return replace(levels, torque=max(levels.torque, largest))
+
+
+def _noise_columns(columns: Columns, levels: NoiseLevels) -> Columns:
+    rng = np.random.default_rng(NOISE_SEED)
+
+    def noisy(segment: Segment) -> Segment:
+        n = segment.samples
+        joint = levels.joint_position * rng.standard_normal(n) if segment.joint_position is not None else None
+        return replace(
+            segment,
+            torque=levels.torque * rng.standard_normal(n),
+            motor_position=levels.motor_position * rng.standard_normal(n),
+            joint_position=joint,
+        )
+
+    record = replace(columns.recording, segments=tuple(noisy(s) for s in columns.segments))
+    return Columns(record, columns.chain, columns.velocities.cutoff_hz, columns.gravity)
+
+
+def _block_noise(block: Block, noise: Columns) -> Array:
+    rows = sum(noise.lengths)
+    return np.column_stack([noise(*c) if c[0] in _NOISY_SIGNALS else np.zeros(rows) for c in block.columns])
+
+
+def torque_delay(model: Model, result: FitResult, columns: Columns, lengths: Sequence[int]) -> Nuisance:
+    """Delay of the acting torque after its stamp, s, and what it would do to the parameters.
+
+    A delay tau turns Gm into Gm - tau Gm'; every torque column moves with it.
+    """
+    gradients = []
+    for block, a in zip(model.blocks, model.coefficients(result.theta), strict=True):
+        gradient = np.zeros(sum(columns.lengths))
+        for (signal, order), coefficient in zip(block.columns, a, strict=True):
+            if signal == "torque":
+                gradient -= coefficient * columns("torque", order + 1)
+        gradients.append(gradient)
+    return _nuisance(result, gradients, lengths)
+
+
+def torque_hold(model: Model, result: FitResult, columns: Columns) -> Array:
+    """Shift of the parameters if the torque acts as steps held for one sample, shape (p,).
+
+    Beside its half-sample delay a hold of T damps the torque by sinc(f T), about 1 - (w T)^2 / 24.
+    """
+    period = 1.0 / columns.recording.sample_rate_hz
+    gradients = []
+    for block, a in zip(model.blocks, model.coefficients(result.theta), strict=True):
+        gradient = np.zeros(sum(columns.lengths))
+        for (signal, order), coefficient in zip(block.columns, a, strict=True):
+            if signal == "torque":
+                gradient += coefficient * columns("torque", order + 2) * period**2 / 24.0
+        gradients.append(gradient)
+    column = np.concatenate([w * g for w, g in zip(result.weights, gradients, strict=True)])
+    return -_solve_normal(result, result.jacobian.T @ column)
+
+
+def reversal_width(model: Model, result: FitResult, columns: Columns, lengths: Sequence[int]) -> Nuisance | None:
+    """Relative error of the reversal width v0, and what it would do to the parameters; None for a plain sign."""
+    width = columns.reversal_velocity
+    if not width:
+        return None
+    step = 0.2
+    other = columns.like()
+    other.set_reversal_velocity(width * (1.0 + step))
+    gradients = [g / step for g in _sign_changes(model, result, columns, other)]
+    return _nuisance(result, gradients, lengths)
+
+
+def sign_band(model: Model, result: FitResult, columns: Columns) -> Array:
+    """Shift of the parameters if the velocity whose sign is taken had a narrower band, shape (p,).
+
+    A reversal that the filter smooths, or noise that it lets through, changes the friction columns.
+    """
+    other = columns.like(sign_cutoff_hz=SIGN_BAND_STEP * columns.velocities.cutoff_hz)
+    other.set_reversal_velocity(columns.reversal_velocity)
+    gradients = _sign_changes(model, result, columns, other)
+    column = np.concatenate([w * g for w, g in zip(result.weights, gradients, strict=True)])
+    return -_solve_normal(result, result.jacobian.T @ column)
+
+
+def _sign_changes(model: Model, result: FitResult, columns: Columns, other: Columns) -> list[Array]:
+    """Change of each block's residual when the sign columns are those of ``other``."""
+    changes = []
+    for block, a in zip(model.blocks, model.coefficients(result.theta), strict=True):
+        change = np.zeros(sum(columns.lengths))
+        for coefficient, (signal, order) in zip(a, block.columns, strict=True):
+            if signal.startswith("sign_"):
+                change += coefficient * (other(signal, order) - columns(signal, order))
+        changes.append(change)
+    return changes
+
+
+def _nuisance(result: FitResult, gradients: Sequence[Array], lengths: Sequence[int]) -> Nuisance:
+    """One step of the fit with a further parameter whose derivative of the residuals is given."""
+    column = np.concatenate([w * g for w, g in zip(result.weights, gradients, strict=True)])
+    residual = np.concatenate([w * e for w, e in zip(result.weights, result.residuals, strict=True)])
+    J = result.jacobian
+    projection = _solve_normal(result, J.T @ column)
+    free = column - J @ projection
+    energy = float(free @ free)
+    if energy <= 1e-12 * float(column @ column):
+        return Nuisance(0.0, float("inf"), np.full(result.theta.size, np.inf))
+    value = -float(free @ residual) / energy
+    scores = (free * (residual + value * free)).reshape(len(gradients), -1).sum(axis=0)
+    covariance = robust_covariance(scores[:, None], np.array([[1.0 / energy]]), lengths).covariance
+    return Nuisance(value, float(np.sqrt(covariance[0, 0])), -projection * value)
+
+
+def _solve_normal(result: FitResult, right: Array) -> Array:
+    """(J'J)^-1 right, by the column-scaled singular value decomposition."""
+    scale = np.linalg.norm(result.jacobian, axis=0)
+    scale[scale == 0.0] = 1.0
+    _, s, Vt = np.linalg.svd(result.jacobian / scale, full_matrices=False)
+    inverse = np.where(np.arange(s.size) < result.rank, 1.0 / np.maximum(s, 1e-300) ** 2, 0.0)
+    return np.asarray(Vt.T @ (inverse * (Vt @ (right / scale))) / scale, dtype=np.float64)

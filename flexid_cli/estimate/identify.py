@@ -1,0 +1,248 @@
+"""From a recording to parameters: the main job."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexid_cli.errors import DataError
+from flexid_cli.estimate import band, budget, paper_route, summary
+from flexid_cli.estimate.fit import block_matrices, fit
+from flexid_cli.estimate.least_squares import solve
+from flexid_cli.estimate.result import Identification, ModelResult, Skipped
+from flexid_cli.estimate.reversal import fit_reversal_velocity
+from flexid_cli.estimate.solution import Solution
+from flexid_cli.models import motor_only
+from flexid_cli.models.motor_only import MotorOnly
+from flexid_cli.models.rigid import Rigid
+from flexid_cli.models.two_encoders import TwoEncoders, TwoEncodersStructured
+from flexid_cli.pipeline.chain import Chain
+from flexid_cli.pipeline.columns import Columns
+
+if TYPE_CHECKING:
+    from flexid_cli.config.schema import Config
+    from flexid_cli.signals.recording import Recording
+
+Array = NDArray[np.float64]
+
+# Over a smaller motion cos q and sin q are a constant and a slope to 1.5 % of the gravity moment.
+SMALL_MOTION_RAD = 0.35
+MAX_REBUILDS = 8
+RETUNE_TOLERANCE = 0.15
+RIGID_BIAS_OVER_STDERR = 0.3
+
+
+def identify(recording: Recording, config: Config) -> Identification:
+    """Solve the models that the configuration asks for, or all that the signals allow.
+
+    Parameters
+    ----------
+    recording : Recording
+        Joint side, SI.
+    config : Config
+        Axis, pipeline and estimate options.
+
+    Returns
+    -------
+    Identification
+
+    Raises
+    ------
+    DataError
+        No model can be solved on this recording.
+    """
+    ids = _model_ids(recording, config)
+    flexible = [i for i in ids if i != "rigid"]
+    f1 = None
+    if flexible and config.axis.f1_hz is None:
+        f1 = band.find_resonance(recording, config.axis.gravity_m_per_s2)
+    models: list[ModelResult] = []
+    skipped: list[Skipped] = []
+    for model_id in ids:
+        try:
+            models.append(_solve(recording, config, model_id, f1))
+        except DataError as error:
+            skipped.append(Skipped(model_id, str(error.message) + (f" ({error.hint})" if error.hint else "")))
+    if config.models is None and not models and "rigid" not in ids:
+        models.append(_solve(recording, config, "rigid", None))
+    if not models:
+        reasons = "; ".join(f"{s.id}: {s.reason}" for s in skipped)
+        raise DataError(f"no model can be solved on this recording: {reasons}", "record what the reasons name")
+    return Identification(tuple(models), tuple(skipped), tuple(recording.notes))
+
+
+def _model_ids(recording: Recording, config: Config) -> tuple[str, ...]:
+    ids = config.models or (("two_encoders",) if recording.has_joint_position else ()) + ("motor_only",)
+    if "two_encoders" in ids and not recording.has_joint_position:
+        raise DataError(
+            "the model two_encoders needs joint_position, which the configuration does not name",
+            "add signals.joint_position, or take `two_encoders` out of `models`",
+        )
+    return tuple(ids)
+
+
+def _solve(recording: Recording, config: Config, model_id: str, f1: float | None) -> ModelResult:
+    if config.estimate.route == "paper" and model_id != "rigid":
+        tuning = band.choose_tuning(recording, config, model_id, f1)
+        return paper_route.solve_paper(make_columns(recording, config, tuning), config, model_id, tuning)
+    solver = {"two_encoders": _two_encoders, "motor_only": _motor_only, "rigid": _rigid}[model_id]
+    solution = solver(recording, config, f1)
+    fitted = summary.fitted_resonance(solution.model, solution.result.theta)
+    off = abs(fitted / solution.tuning.f1_hz - 1.0) if fitted and solution.tuning.f1_hz else 0.0
+    if solution.tuning.f1_source == "data" and fitted and off > RETUNE_TOLERANCE:
+        # The scan's resonance came from a simpler fit; tune once more to the one that the full fit finds.
+        solution = solver(recording, config, fitted)
+    return summary.summarise(solution, config)
+
+
+def make_columns(recording: Recording, config: Config, tuning: band.Tuning) -> Columns:
+    """Columns of the recording through the chosen chain.
+
+    Raises
+    ------
+    DataError
+        No segment is long enough for the filters.
+    """
+    columns = Columns(recording, Chain(tuning.chain), tuning.sign_cutoff_hz, config.axis.gravity_m_per_s2)
+    if not columns.segments:
+        longest = max(s.samples for s in recording.segments) / recording.sample_rate_hz
+        raise DataError(
+            f"the longest gap-free stretch, {longest:.3g} s, is too short for a band of"
+            f" {columns.chain.band_hz:.3g} Hz",
+            "record longer, raise pipeline.band_hz, or permit longer gaps with signals.time.max_gap_s",
+        )
+    return columns
+
+
+def _two_encoders(recording: Recording, config: Config, f1: float | None) -> Solution:
+    tuning = band.choose_tuning(recording, config, "two_encoders", f1)
+    columns = make_columns(recording, config, tuning)
+    linear = TwoEncoders()
+
+    # The sum of both equations holds neither torsion nor a trivial solution: its residual judges the width.
+    total = TwoEncodersStructured.blocks[0]
+
+    def cost() -> float:
+        return _log_residual(columns, total.columns)
+
+    columns.set_reversal_velocity(fit_reversal_velocity(columns, cost))
+    candidates = {}
+    start = np.ones(len(linear.parameters))
+    for method, model, weighted in (
+        ("ols", linear, False),
+        ("wls", linear, True),
+        ("structured", TwoEncodersStructured(), True),
+    ):
+        matrices = block_matrices(model, columns)
+        result = fit(
+            model, matrices, start, columns.lengths, weighted=weighted, covariance=config.estimate.covariance
+        )
+        start = result.theta
+        candidates[method] = Solution(model, columns, matrices, result, tuning, method, "")
+    if config.estimate.method != "auto":
+        return replace(candidates[config.estimate.method], method_reason="configured")
+    return _surest(candidates)
+
+
+def _surest(candidates: dict[str, Solution]) -> Solution:
+    """The estimator with the smallest total uncertainty of Jm, K and JL, noise bias included."""
+    levels = None
+    totals = {}
+    for method, solution in candidates.items():
+        levels = levels or budget.noise_levels(solution.columns.recording)
+        bias = budget.noise_bias(solution.model, solution.result, solution.columns, levels)
+        total = np.hypot(solution.result.stderr, bias)[[0, 3, 4]]
+        converged = solution.result.converged
+        totals[method] = float(np.sum((total / solution.result.theta[[0, 3, 4]]) ** 2)) if converged else np.inf
+    best = min(totals, key=lambda m: totals[m])
+    listed = ", ".join(f"{m} {100 * np.sqrt(v / 3):.2g} %" for m, v in totals.items())
+    reason = f"smallest relative uncertainty of Jm, K, JL with noise bias ({listed})"
+    return replace(candidates[best], method_reason=reason)
+
+
+def _motor_only(recording: Recording, config: Config, f1: float | None) -> Solution:
+    tuning = band.choose_tuning(recording, config, "motor_only", f1)
+    columns = make_columns(recording, config, tuning)
+    model = MotorOnly(gravity_form(recording))
+    linear = [c for c in model.blocks[0].columns if c != ("sign_joint", 0)]
+
+    def cost() -> float:
+        return _log_residual(columns, linear)
+
+    columns.set_reversal_velocity(fit_reversal_velocity(columns, cost))
+    theta = _motor_start(columns, model)
+    for _ in range(MAX_REBUILDS):
+        Jm, K, _, FVm, _, FSm = theta[:6]
+        columns.rebuild_joint(Jm, FVm, FSm, K)
+        matrices = block_matrices(model, columns)
+        result = fit(
+            model, matrices, theta, columns.lengths, weighted=False, covariance=config.estimate.covariance
+        )
+        moved = np.max(np.abs(result.theta[:3] / theta[:3] - 1.0))
+        theta = result.theta
+        if moved < 1e-6:
+            break
+    reason = "direct fit of the physical parameters to the exact equation (18), all terms kept"
+    return Solution(model, columns, matrices, result, tuning, "structured", reason)
+
+
+def _log_residual(columns: Columns, names: Sequence[tuple[str, int]]) -> float:
+    """Logarithm of the residual's size when the first column is regressed on the others."""
+    W = np.column_stack([columns(*c) for c in names])
+    R = np.linalg.qr(W / np.linalg.norm(W, axis=0), mode="r")
+    rest = R[:, 0] - R[:, 1:] @ np.linalg.lstsq(R[:, 1:], R[:, 0], rcond=None)[0]
+    return float(np.log(max(np.linalg.norm(rest), 1e-300)))
+
+
+def _motor_start(columns: Columns, model: MotorOnly) -> Array:
+    names = [("torque", 2), ("torque", 1), ("motor", 4), ("motor", 3), ("motor", 2), ("motor", 1)]
+    names += [("sign_motor", 0), ("one", 0), ("motor", 0)]
+    W = np.column_stack([columns(*c) for c in names])
+    W[:, :2] *= -1.0
+    X = solve(W, columns("torque", 0)).estimate
+    start = motor_only.starting_point(X)
+    if not np.all(start[:3] > 0.0):
+        raise DataError(
+            "the motor's own motion shows no resonance in the band used: the regression gives a negative"
+            " stiffness or inertia",
+            "excite the axis around its first resonance, give axis.f1_hz, or record the joint encoder",
+        )
+    return np.concatenate([start, np.zeros(len(model.parameters) - start.size)])
+
+
+def _rigid(recording: Recording, config: Config, f1: float | None) -> Solution:
+    tuning = band.choose_tuning(recording, config, "rigid", f1)
+    fixed = config.pipeline.band_hz is not None or config.pipeline.decimation is not None
+    levels = budget.noise_levels(recording)
+    model = Rigid(gravity_form(recording))
+    start = np.zeros(len(model.parameters))
+    while True:
+        columns = make_columns(recording, config, tuning)
+
+        def cost(columns: Columns = columns) -> float:
+            return _log_residual(columns, model.blocks[0].columns)
+
+        columns.set_reversal_velocity(fit_reversal_velocity(columns, cost))
+        matrices = block_matrices(model, columns)
+        result = fit(
+            model, matrices, start, columns.lengths, weighted=False, covariance=config.estimate.covariance
+        )
+        bias = budget.noise_bias(model, result, columns, levels)
+        narrower = band.narrower(tuning, config, recording)
+        if fixed or narrower is None or abs(bias[0]) < RIGID_BIAS_OVER_STDERR * result.stderr[0]:
+            break
+        tuning = narrower
+    return Solution(model, columns, matrices, result, tuning, "ols", "one equation, linear in its parameters")
+
+
+def gravity_form(recording: Recording) -> str:
+    """How gravity enters a model without joint encoder: none, a spring, or its two moments."""
+    if recording.linear:
+        return "none"
+    low = min(float(s.motor_position.min()) for s in recording.segments)
+    high = max(float(s.motor_position.max()) for s in recording.segments)
+    return "spring" if high - low < SMALL_MOTION_RAD else "moments"

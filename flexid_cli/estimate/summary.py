@@ -1,0 +1,365 @@
+"""From a solved model to the result that the report renders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexid_cli.estimate import budget, overdetermination
+from flexid_cli.estimate.result import Estimate, Fit, ModelResult, PipelineSummary, Spectrum, Trace
+from flexid_cli.estimate.solution import Solution
+from flexid_cli.estimate.verdict import correlated_with, judge, undetermined
+from flexid_cli.models.base import Model, Parameter, unit_of
+from flexid_cli.pipeline.tuning import DECIMATION_EDGE
+
+if TYPE_CHECKING:
+    from flexid_cli.config.schema import Config
+    from flexid_cli.pipeline.columns import Columns
+
+Array = NDArray[np.float64]
+
+HAC = "Student's t, standard error robust to correlated residuals, with noise and timing budget"
+IID = "Student's t, independent residuals"
+TORSION_ZERO = Parameter("torsion_zero", "z", "position")
+DERIVED = (
+    Parameter("resonance", "f1", "frequency"),
+    Parameter("antiresonance", "fa", "frequency"),
+    Parameter("inertia_ratio", "JL/Jm", "ratio"),
+)
+SIGNIFICANT_DELAY_SAMPLES = 0.1
+SPECTRUM_SEGMENT_S = 8.0
+# A uniform doubt between zero and the full shift has this standard deviation about zero.
+UNIFORM = 1.0 / np.sqrt(3.0)
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Total standard errors and what they are made of.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (p, p)
+        Random part plus the outer products of the systematic shifts.
+    degrees_of_freedom : ndarray, shape (p,)
+        Of the total: the systematic part counts as known.
+    largest : tuple of str
+        The largest systematic source of each parameter where it exceeds the random part, else empty.
+    delay : budget.Nuisance
+        Torque delay as the residuals show it.
+    """
+
+    covariance: Array
+    degrees_of_freedom: Array
+    largest: tuple[str, ...]
+    delay: budget.Nuisance
+
+
+def summarise(solution: Solution, config: Config, *, regression: bool = True) -> ModelResult:
+    """Parameters with intervals and verdicts, derived quantities, fit, tests and figures' data."""
+    uncertainty = total_uncertainty(solution, config)
+    parameters, theta, covariance = _reported(solution.model, solution.result.theta, uncertainty.covariance)
+    estimates = _estimates(solution, config, uncertainty, parameters, theta, covariance)
+    correlation = _correlation(covariance)
+    tests: dict[str, dict[str, Any]] = {"torque_delay": _delay_test(uncertainty.delay, solution)}
+    free: tuple[Estimate, ...] = ()
+    if regression and solution.model.id == "motor_only":
+        free, tests["over_determination"] = overdetermination.regression(
+            solution, config, make=lambda p, v, s, d: _judge(solution, config, p, v, s, d)
+        )
+    effects = dict.fromkeys(p.effect for p in parameters if p.effect)
+    return ModelResult(
+        id=solution.model.id,
+        method=solution.method,
+        method_reason=solution.method_reason,
+        equation=solution.model.equation,
+        parameters=estimates,
+        regression=free,
+        derived=_derived(solution, config, uncertainty),
+        correlation_names=tuple(p.symbol for p in parameters),
+        correlation=correlation,
+        condition_number=solution.result.condition_number,
+        rank=solution.result.rank,
+        columns=solution.result.theta.size,
+        fit=_fit(solution),
+        pipeline=pipeline_summary(solution),
+        trace=_trace(solution),
+        spectrum=_spectrum(solution.columns),
+        added_terms=tuple(effects),
+        tests=tests,
+        warnings=_warnings(solution, uncertainty, config),
+    )
+
+
+def total_uncertainty(solution: Solution, config: Config) -> Uncertainty:
+    """Random and systematic part of the estimates' uncertainty."""
+    model, result, columns = solution.model, solution.result, solution.columns
+    lengths = columns.lengths
+    delay = budget.torque_delay(model, result, columns, lengths)
+    shifts: dict[str, Array] = {}
+    if config.estimate.covariance == "hac":
+        levels = budget.limited_torque_noise(model, result, columns, budget.noise_levels(columns.recording))
+        shifts["encoder and torque noise in the columns"] = budget.noise_bias(model, result, columns, levels)
+        torque = config.signals.torque
+        held = 1.0 if torque.hold == "sample" else UNIFORM
+        if torque.hold != "instant":
+            shifts["the torque held between samples"] = held * budget.torque_hold(model, result, columns)
+        if torque.hold is None and torque.delay_s is None:
+            shifts["the torque's timing"] = _with_own_error(delay)
+        width = budget.reversal_width(model, result, columns, lengths)
+        if width is not None:
+            shifts["the width of the friction reversal"] = _with_own_error(width)
+        shifts["the band of the friction's velocity"] = budget.sign_band(model, result, columns)
+    covariance = result.covariance + sum(np.outer(s, s) for s in shifts.values())
+    random = np.maximum(np.diag(result.covariance), np.finfo(float).tiny)
+    share = np.diag(covariance) / random
+    dof = np.minimum(result.degrees_of_freedom * share**2, 1e6)
+    largest = []
+    for k in range(result.theta.size):
+        name = max(shifts, key=lambda n, k=k: abs(shifts[n][k]), default="")
+        largest.append(name if name and shifts[name][k] ** 2 > random[k] else "")
+    return Uncertainty(covariance, dof, tuple(largest), delay)
+
+
+def _with_own_error(nuisance: budget.Nuisance) -> Array:
+    """Shift enlarged by the nuisance's own standard error."""
+    if nuisance.value == 0.0 or not np.isfinite(nuisance.stderr):
+        return np.zeros_like(nuisance.shift)
+    return nuisance.shift * float(np.hypot(1.0, nuisance.stderr / nuisance.value))
+
+
+def _reported(model: Model, theta: Array, covariance: Array) -> tuple[tuple[Parameter, ...], Array, Array]:
+    """Parameters as the report names them: the spring's torque c at zero torsion becomes the zero z = c / K."""
+    symbols = [p.symbol for p in model.parameters]
+    if "c" not in symbols:
+        return model.parameters, theta, covariance
+    c, k = symbols.index("c"), symbols.index("K")
+    G = np.eye(theta.size)
+    G[c, c], G[c, k] = 1.0 / theta[k], -theta[c] / theta[k] ** 2
+    reported = theta.copy()
+    reported[c] = theta[c] / theta[k]
+    parameters = tuple(TORSION_ZERO if p.symbol == "c" else p for p in model.parameters)
+    return parameters, reported, G @ covariance @ G.T
+
+
+def _estimates(
+    solution: Solution,
+    config: Config,
+    uncertainty: Uncertainty,
+    parameters: tuple[Parameter, ...],
+    theta: Array,
+    covariance: Array,
+) -> tuple[Estimate, ...]:
+    correlation = _correlation(covariance)
+    symbols = tuple(p.symbol for p in parameters)
+    estimates = []
+    for k, parameter in enumerate(parameters):
+        if k in solution.result.dependent:
+            others = ", ".join(symbols[j] for j in solution.result.dependent if j != k)
+            reason = f"its column depends on those of {others}" if others else "its column is zero"
+            estimates.append(undetermined(parameter, _unit(solution, parameter), reason))
+            continue
+        doubts = [correlated_with(correlation, symbols, k)]
+        if uncertainty.largest[k]:
+            doubts.append(f"limited by {uncertainty.largest[k]}")
+        estimates.append(
+            _judge(
+                solution,
+                config,
+                parameter,
+                float(theta[k]),
+                float(np.sqrt(covariance[k, k])),
+                float(uncertainty.degrees_of_freedom[k]),
+                "; ".join(d for d in doubts if d),
+            )
+        )
+    return tuple(estimates)
+
+
+def _judge(
+    solution: Solution,
+    config: Config,
+    parameter: Parameter,
+    value: float,
+    stderr: float,
+    dof: float,
+    doubt: str = "",
+) -> Estimate:
+    return judge(
+        parameter,
+        _unit(solution, parameter),
+        value,
+        stderr,
+        dof,
+        level=config.estimate.confidence_level,
+        method=HAC if config.estimate.covariance == "hac" else IID,
+        doubt=doubt,
+    )
+
+
+def _unit(solution: Solution, parameter: Parameter) -> str:
+    recording = solution.columns.recording
+    return unit_of(parameter.quantity, linear=recording.linear, torque_unit=recording.torque_unit)
+
+
+def fitted_resonance(model: Model, theta: Array) -> float | None:
+    """Free-free resonance of the fitted parameters, Hz; None for a rigid model or forbidden signs."""
+    symbols = [p.symbol for p in model.parameters]
+    if "K" not in symbols:
+        return None
+    Jm, K, JL = (float(theta[symbols.index(s)]) for s in ("Jm", "K", "JL"))
+    if min(Jm, K, JL) <= 0.0:
+        return None
+    return float(np.sqrt(K * (1.0 / Jm + 1.0 / JL)) / (2.0 * np.pi))
+
+
+def _derived(solution: Solution, config: Config, uncertainty: Uncertainty) -> tuple[Estimate, ...]:
+    """Resonance, antiresonance and inertia ratio, by the delta method."""
+    theta = solution.result.theta
+    if fitted_resonance(solution.model, theta) is None:
+        return ()
+    symbols = [p.symbol for p in solution.model.parameters]
+    index = [symbols.index(s) for s in ("Jm", "K", "JL")]
+    Jm, K, JL = theta[index]
+    f1 = np.sqrt(K * (1.0 / Jm + 1.0 / JL)) / (2.0 * np.pi)
+    fa = np.sqrt(K / JL) / (2.0 * np.pi)
+    ratio = JL / Jm
+    reduced = 1.0 / Jm + 1.0 / JL
+    gradients = (
+        (f1, np.array([-0.5 * f1 / (Jm**2 * reduced), 0.5 * f1 / K, -0.5 * f1 / (JL**2 * reduced)])),
+        (fa, np.array([0.0, 0.5 * fa / K, -0.5 * fa / JL])),
+        (ratio, np.array([-ratio / Jm, 0.0, 1.0 / Jm])),
+    )
+    covariance = uncertainty.covariance[np.ix_(index, index)]
+    dof = float(np.min(uncertainty.degrees_of_freedom[index]))
+    return tuple(
+        _judge(solution, config, parameter, float(value), float(np.sqrt(g @ covariance @ g)), dof)
+        for parameter, (value, g) in zip(DERIVED, gradients, strict=True)
+    )
+
+
+def _correlation(covariance: Array) -> Array:
+    size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    size[size == 0.0] = np.nan
+    return np.asarray(covariance / np.outer(size, size), dtype=np.float64)
+
+
+def _fit(solution: Solution) -> Fit:
+    torque = solution.columns("torque", 0)
+    residual = solution.result.residuals[0]
+    spread = float(np.linalg.norm(torque - torque.mean()))
+    return Fit(
+        torque_rms=float(np.sqrt(np.mean(torque**2))),
+        residual_rms=float(np.sqrt(np.mean(residual**2))),
+        fit_percent=100.0 * (1.0 - float(np.linalg.norm(residual)) / spread) if spread else 0.0,
+        unit=solution.columns.recording.torque_unit,
+    )
+
+
+def _trace(solution: Solution) -> Trace:
+    torque = solution.columns("torque", 0)
+    predicted = torque - solution.result.residuals[0]
+    return Trace(solution.columns.times, torque, predicted, solution.columns.recording.torque_unit)
+
+
+def _spectrum(columns: Columns) -> Spectrum:
+    from scipy.signal import welch
+
+    recording = columns.recording
+    segment = max(recording.segments, key=lambda s: s.samples)
+    length = int(min(segment.samples, max(256, SPECTRUM_SEGMENT_S * recording.sample_rate_hz)))
+    frequency, density = welch(segment.torque, fs=recording.sample_rate_hz, nperseg=length)
+    return Spectrum(frequency[1:], np.sqrt(density[1:]), f"{recording.torque_unit}/sqrt(Hz)")
+
+
+def pipeline_summary(solution: Solution) -> PipelineSummary:
+    """What was done to the data, in numbers and in words."""
+    columns, tuning = solution.columns, solution.tuning
+    chain, settings = columns.chain, columns.chain.settings
+    rate = settings.sample_rate_hz
+    longest = max(s.samples for s in columns.segments)
+    trimmed = chain.trim_samples(longest) / rate
+    grid = np.geomspace(max(0.01, chain.band_hz / 300.0), 0.5 * rate, 400)
+    return PipelineSummary(
+        sample_rate_hz=rate,
+        steps=_steps(solution, trimmed),
+        lowpass_order=settings.lowpass_order,
+        lowpass_cutoff_hz=settings.lowpass_cutoff_hz,
+        derivative=settings.derivative,
+        decimation=settings.decimation,
+        effective_band_hz=(rate / longest, chain.band_hz),
+        limited_by=chain.limited_by,
+        sign_cutoff_hz=tuning.sign_cutoff_hz,
+        reversal_velocity=columns.reversal_velocity,
+        rows=sum(columns.lengths),
+        trimmed_s=trimmed,
+        f1_hz=tuning.f1_hz,
+        f1_source=tuning.f1_source,
+        magnitude_hz=grid,
+        magnitude=chain.magnitude(grid),
+    )
+
+
+def _steps(solution: Solution, trimmed: float) -> tuple[str, ...]:
+    settings = solution.columns.chain.settings
+    steps = []
+    if settings.lowpass_cutoff_hz is not None:
+        steps.append(
+            f"zero-phase Butterworth low pass on every column, order {settings.lowpass_order} each way,"
+            f" {settings.lowpass_cutoff_hz:.4g} Hz (-6 dB)"
+        )
+    if settings.derivative == "exact":
+        steps.append(f"exact derivative, {2 * solution.columns.chain.half_width + 1}-point maximally flat difference")
+    else:
+        steps.append("central difference, repeated for higher derivatives (eq. 22)")
+    width = solution.columns.reversal_velocity
+    shape = f"tanh(v / {width:.3g})" if width else "sgn v"
+    steps.append(f"friction sign {shape} from the velocity below {solution.tuning.sign_cutoff_hz:.4g} Hz")
+    if settings.decimation > 1:
+        edge = 0.5 * DECIMATION_EDGE * settings.sample_rate_hz / settings.decimation
+        steps.append(
+            f"parallel decimation by {settings.decimation}: zero-phase Chebyshev I, order 8, 0.05 dB,"
+            f" {edge:.4g} Hz, one row in {settings.decimation}"
+        )
+    steps.append(f"{trimmed:.3g} s trimmed at each edge of each segment")
+    return tuple(steps)
+
+
+def _delay_test(delay: budget.Nuisance, solution: Solution) -> dict[str, Any]:
+    rate = solution.columns.recording.sample_rate_hz
+    known = bool(np.isfinite(delay.stderr))
+    return {
+        "value_s": delay.value if known else None,
+        "stderr_s": delay.stderr if known else None,
+        "value_samples": delay.value * rate if known else None,
+        "meaning": "delay of the acting torque after its stamp as the residuals show it; not applied",
+    }
+
+
+def _warnings(solution: Solution, uncertainty: Uncertainty, config: Config) -> tuple[str, ...]:
+    warnings = []
+    rate = solution.columns.recording.sample_rate_hz
+    delay = uncertainty.delay
+    samples = delay.value * rate
+    clear = np.isfinite(delay.stderr) and abs(delay.value) > 3.0 * delay.stderr
+    if clear and abs(samples) > SIGNIFICANT_DELAY_SAMPLES:
+        torque = config.signals.torque_role
+        cure = f"signals.{torque}.delay_s: {-delay.value:.3g}"
+        if abs(samples - 0.5) < 0.2 and config.signals.torque.hold is None:
+            cure = f"signals.{torque}.hold: sample"
+        warnings.append(
+            f"{solution.model.id}: the torque seems to act {1e3 * delay.value:.3g} ms ({samples:.2g} samples) after"
+            f" its stamp; if the drive's timing confirms it, set {cure}"
+        )
+    if not solution.result.converged:
+        warnings.append(f"{solution.model.id}: the fit did not settle; treat its numbers with care")
+    f1, band = solution.tuning.f1_hz, solution.columns.chain.band_hz
+    if f1 and solution.model.id != "rigid" and band < f1:
+        warnings.append(
+            f"{solution.model.id}: the effective band ends at {band:.3g} Hz, below the resonance at {f1:.3g} Hz"
+        )
+    return tuple(warnings)
+
+

@@ -1,0 +1,95 @@
+"""What a model is: blocks of filtered columns and the coefficients that the parameters give them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# column(signal, derivative) -> filtered and decimated rows; signals are those of pipeline.columns
+ColumnSource = Callable[[str, int], Array]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One physical parameter.
+
+    Attributes
+    ----------
+    name, symbol : str
+        Report name and symbol of DESIGN: ``joint_stiffness``, ``K``.
+    quantity : str
+        Key of `unit_of`.
+    positive : bool
+        Physics forbids a negative value.
+    effect : str
+        Name of the effect that this parameter belongs to where it is beyond the declared baseline.
+    """
+
+    name: str
+    symbol: str
+    quantity: str
+    positive: bool = False
+    effect: str = ""
+
+
+@dataclass(frozen=True)
+class Block:
+    """One equation: residual = columns @ coefficients(theta).
+
+    Attributes
+    ----------
+    name : str
+        ``motor``, ``load``, ``total``, ``torsion``.
+    columns : tuple of (str, int)
+        Signal and order of derivative of each column.
+    """
+
+    name: str
+    columns: tuple[tuple[str, int], ...]
+
+
+class Model(Protocol):
+    """A model that is linear in its filtered columns, with coefficients that depend on the parameters."""
+
+    id: str
+    equation: str
+    parameters: tuple[Parameter, ...]
+    blocks: tuple[Block, ...]
+
+    def coefficients(self, theta: Array) -> tuple[Array, ...]:
+        """Coefficients of each block's columns, shapes (columns,)."""
+        ...
+
+    def jacobian(self, theta: Array) -> tuple[Array, ...]:
+        """Their derivatives, shapes (columns, p)."""
+        ...
+
+
+# Units by (rotary, linear) of quantities whose torque unit is N.m or N; with an unknown torque constant the
+# torque stays in ampere and the others follow.
+_UNITS = {
+    "inertia": ("kg.m2", "kg", "A.s2/rad", "A.s2/m"),
+    "stiffness": ("N.m/rad", "N/m", "A/rad", "A/m"),
+    "viscous": ("N.m.s/rad", "N.s/m", "A.s/rad", "A.s/m"),
+    "torque": ("N.m", "N", "A", "A"),
+    "first_moment": ("kg.m", "kg.m", "A.s2/m", "A.s2/m"),
+    "position": ("rad", "m", "rad", "m"),
+    "velocity": ("rad/s", "m/s", "rad/s", "m/s"),
+    "frequency": ("Hz", "Hz", "Hz", "Hz"),
+    "time": ("s", "s", "s", "s"),
+    "time_squared": ("s2", "s2", "s2", "s2"),
+    "inertia_time_squared": ("kg.m2.s2", "kg.s2", "A.s4/rad", "A.s4/m"),
+    "inertia_time": ("kg.m2.s", "kg.s", "A.s3/rad", "A.s3/m"),
+    "ratio": ("1", "1", "1", "1"),
+}
+
+
+def unit_of(quantity: str, *, linear: bool, torque_unit: str) -> str:
+    """Unit of a quantity on a rotary or linear axis, with torque in N m (N) or in A."""
+    return _UNITS[quantity][int(linear) + (2 if torque_unit == "A" else 0)]

@@ -1,0 +1,143 @@
+"""The unfiltered signals behind the columns of the observation matrix, and the columns themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexid_cli.pipeline import derivatives, filters
+from flexid_cli.pipeline.chain import Chain
+from flexid_cli.signals.recording import Recording, Segment
+
+Array = NDArray[np.float64]
+
+SIGN_FILTER_ORDER = 2
+
+
+@dataclass(frozen=True)
+class Velocities:
+    """Velocities of a wider band than the chain's, whose sign Coulomb friction follows.
+
+    A velocity filtered as narrowly as the columns would lose reversals above the band.
+    """
+
+    cutoff_hz: float
+    sample_rate_hz: float
+
+    def lowpass(self, x: Array) -> Array:
+        """Zero-phase low pass at the sign's own cutoff."""
+        sos = filters.butterworth(SIGN_FILTER_ORDER, self.cutoff_hz, self.sample_rate_hz)
+        return filters.zero_phase(x, sos)
+
+    def derivative(self, x: Array, order: int = 1) -> Array:
+        """Derivative of the low-passed signal."""
+        smooth = self.lowpass(x)
+        return derivatives.differentiate(smooth, order, 1.0 / self.sample_rate_hz, half_width=3)
+
+
+class Columns:
+    """Columns of one recording through one chain, each computed once.
+
+    Parameters
+    ----------
+    recording : Recording
+        Joint side, SI.
+    chain : Chain
+        The filters common to all columns.
+    sign_cutoff_hz : float
+        Band of the velocities whose sign is taken.
+    gravity_m_per_s2 : float
+        For the gravity columns g cos q and g sin q.
+    """
+
+    def __init__(
+        self, recording: Recording, chain: Chain, sign_cutoff_hz: float, gravity_m_per_s2: float = 9.81
+    ) -> None:
+        self.recording = recording
+        self.chain = chain
+        self.gravity = gravity_m_per_s2
+        self.velocities = Velocities(sign_cutoff_hz, recording.sample_rate_hz)
+        self._rebuilt_from: tuple[float, float, float, float] | None = None
+        self.segments = tuple(s for s in recording.segments if chain.rows(s.samples) > 0)
+        self._cache: dict[tuple[str, int], Array] = {}
+        self._signals: dict[str, Callable[[int, Segment], Array]] = {
+            "torque": lambda _, s: s.torque,
+            "motor": lambda _, s: s.motor_position,
+            "joint": lambda i, _: self.joint[i],
+            "torsion": lambda i, s: s.motor_position - self.joint[i],
+            "joint_centred": lambda i, _: self.joint[i] - self.centre,
+            "gravity_cos": lambda i, _: self.gravity * np.cos(self.joint[i]),
+            "gravity_sin": lambda i, _: self.gravity * np.sin(self.joint[i]),
+            "sign_motor": lambda i, _: _sign(self.motor_velocity[i], self.reversal_velocity),
+            "sign_joint": lambda i, _: _sign(self.joint_velocity[i], self.reversal_velocity),
+            "one": lambda _, s: np.ones(s.samples),
+        }
+        self.reversal_velocity: float | None = None
+        self.motor_velocity = [self.velocities.derivative(s.motor_position) for s in self.segments]
+        self.joint: list[Array] = []
+        self.joint_velocity: list[Array] = []
+        self._set_joint([s.motor_position if s.joint_position is None else s.joint_position for s in self.segments])
+        positions = [(float(s.motor_position.min()), float(s.motor_position.max())) for s in self.segments]
+        self.centre = 0.5 * (min(p[0] for p in positions) + max(p[1] for p in positions)) if positions else 0.0
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Rows of each segment."""
+        return tuple(self.chain.rows(s.samples) for s in self.segments)
+
+    @property
+    def times(self) -> Array:
+        """Time of each row from the start of the record, s."""
+        return np.concatenate([self.chain.row_times(s.samples, s.start_s) for s in self.segments])
+
+    def __call__(self, signal: str, derivative: int) -> Array:
+        """One column over all segments, shape (rows,)."""
+        key = (signal, derivative)
+        if key not in self._cache:
+            make = self._signals[signal]
+            parts = [self.chain.apply(make(i, s), derivative) for i, s in enumerate(self.segments)]
+            self._cache[key] = np.concatenate(parts)
+        return self._cache[key]
+
+    def set_reversal_velocity(self, velocity: float | None) -> None:
+        """Take sgn v as tanh(v / velocity); None or 0: as the plain sign."""
+        if velocity != self.reversal_velocity:
+            self.reversal_velocity = velocity
+            self._forget("sign_motor", "sign_joint")
+
+    def like(self, *, sign_cutoff_hz: float | None = None) -> Columns:
+        """The same columns anew, with another band of the signs where one is given."""
+        cutoff = sign_cutoff_hz or self.velocities.cutoff_hz
+        other = Columns(self.recording, self.chain, cutoff, self.gravity)
+        other.set_reversal_velocity(self.reversal_velocity)
+        if self._rebuilt_from is not None:
+            other.rebuild_joint(*self._rebuilt_from)
+        return other
+
+    def rebuild_joint(self, Jm: float, FVm: float, FSm: float, K: float) -> None:
+        """Rebuild the unmeasured joint position from the motor's side, eq. (14), in the band of the signs."""
+        self._rebuilt_from = (Jm, FVm, FSm, K)
+        rebuilt = []
+        for segment, velocity in zip(self.segments, self.motor_velocity, strict=True):
+            acceleration = self.velocities.derivative(segment.motor_position, 2)
+            friction = FVm * velocity + FSm * _sign(velocity, self.reversal_velocity)
+            torque = self.velocities.lowpass(segment.torque) - Jm * acceleration - friction
+            rebuilt.append(self.velocities.lowpass(segment.motor_position) - torque / K)
+        self._set_joint(rebuilt)
+
+    def _set_joint(self, joint: list[Array]) -> None:
+        self.joint = joint
+        self.joint_velocity = [self.velocities.derivative(x) for x in joint]
+        self._forget("joint", "torsion", "joint_centred", "gravity_cos", "gravity_sin", "sign_joint")
+
+    def _forget(self, *signals: str) -> None:
+        self._cache = {key: column for key, column in self._cache.items() if key[0] not in signals}
+
+
+def _sign(velocity: Array, width: float | None) -> Array:
+    if not width:
+        return np.sign(velocity)
+    return np.asarray(np.tanh(velocity / width), dtype=np.float64)

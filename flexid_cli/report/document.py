@@ -1,0 +1,339 @@
+"""The one report document ("flexid-report/1"): plain data that every renderer reads.
+
+Everything that depends on the container (path, format, clock, what the reader met) stands under ``inputs``
+and nowhere else, so that the rest of the report is the same whatever the log was stored in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from flexid_cli import __version__
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from flexid_cli.estimate.result import (
+        Estimate,
+        Fit,
+        Identification,
+        Interval,
+        ModelResult,
+        PipelineSummary,
+    )
+    from flexid_cli.signals.recording import ClockStatistics, Recording
+
+SCHEMA = "flexid-report/1"
+_PAPER = (
+    "M. T. Pham, M. Gautier, P. Poignet: Identification of joint stiffness with bandpass filtering. "
+    "IEEE International Conference on Robotics and Automation (ICRA), Seoul, 2001, pp. 2867-2872. "
+    "doi:10.1109/ROBOT.2001.933056"
+)
+CITATIONS = (_PAPER,)
+_NO_ESTIMATE = "the solve gave no finite number"
+_NO_INTERVAL = "the estimate has no finite confidence interval"
+_NO_REASON = "no reason was given"
+# Step of the recording's history that names the clock.
+_CLOCK_STEP = "clock: "
+_DAMAGE_UNKNOWN = "damaged samples were not counted; what the reader met stands under notes"
+_PART_OF_A_RUN = "one of several files of one run: samples and duration of the run stand under recording"
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Samples of one file by how far they can be trusted."""
+
+    trusted: int
+    suspect: int = 0
+    lost: int = 0
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """One file of the run, and all that depends on how the log was stored.
+
+    Attributes
+    ----------
+    path, sha256, format : str
+        Path as the user gave it, SHA-256 of the content in hex, the reader's name.
+    samples : int or None
+        Samples of the motor position in this file; None takes the recording's where the run is one file.
+    duration_s : float or None
+        From first to last sample of this file, treated like ``samples``.
+    damage : Damage or None
+        None where the reader does not count damaged samples.
+    notes : tuple of str
+        What the reader met in this file. The same sentences among the recording's notes are not repeated
+        among the report's warnings.
+    """
+
+    path: str
+    sha256: str
+    format: str
+    samples: int | None = None
+    duration_s: float | None = None
+    damage: Damage | None = None
+    notes: tuple[str, ...] = ()
+
+
+def build_document(
+    *,
+    identification: Identification,
+    recording: Recording,
+    inputs: Sequence[InputFile],
+    config_digest: str,
+    config_resolved: Mapping[str, Any],
+    citations: Sequence[str] = CITATIONS,
+) -> dict[str, Any]:
+    """Build the report of an identification.
+
+    Parameters
+    ----------
+    identification : Identification
+        What was estimated.
+    recording : Recording
+        What it was estimated from.
+    inputs : sequence of InputFile
+        The files of the run, in their order.
+    config_digest : str
+        SHA-256 of the configuration file.
+    config_resolved : mapping
+        The configuration with all defaults filled in.
+    citations : sequence of str
+        References for the methods that were used.
+
+    Returns
+    -------
+    dict
+        Plain dicts, lists, strings, numbers, bools and None, in a fixed order. Numbers are finite: NaN and
+        infinity become None. An estimate without a number is never anything but ``not_identifiable``, one
+        without an interval never ``identified``.
+
+    Raises
+    ------
+    TypeError
+        A result holds something that is not plain data.
+    """
+    document = {
+        "schema": SCHEMA,
+        "tool": {"name": "flexid", "version": __version__},
+        "inputs": [_input(file, recording, single=len(inputs) == 1) for file in inputs],
+        "config": {"sha256": config_digest, "resolved": config_resolved},
+        "recording": _recording(recording),
+        "models": [_model(model) for model in identification.models],
+        "skipped": [{"id": model.id, "reason": model.reason} for model in identification.skipped],
+        "diagnosis": None,
+        "warnings": _warnings(identification, recording, inputs),
+        "citations": list(citations),
+    }
+    plain = _plain(document)
+    if not isinstance(plain, dict):
+        raise TypeError("the report is not a mapping")
+    return plain
+
+
+def _warnings(identification: Identification, recording: Recording, inputs: Sequence[InputFile]) -> list[str]:
+    """Return every warning once; what a reader said of its file stands under that input alone."""
+    told = {note for file in inputs for note in file.notes}
+    warnings = dict.fromkeys([*identification.warnings, *recording.notes])
+    return [warning for warning in warnings if warning not in told]
+
+
+def _input(file: InputFile, recording: Recording, *, single: bool) -> dict[str, Any]:
+    clock = _leading_clock(recording.clocks)
+    samples, duration_s, notes = file.samples, file.duration_s, file.notes
+    if single:
+        samples = clock.samples if samples is None and clock is not None else samples
+        duration_s = recording.duration_s if duration_s is None else duration_s
+    elif samples is None or duration_s is None:
+        notes = (*notes, _PART_OF_A_RUN)
+    damage = file.damage
+    return {
+        "path": file.path,
+        "sha256": file.sha256,
+        "format": file.format,
+        "clock": None if clock is None else clock.clock,
+        "clock_reason": _clock_reason(recording, "" if clock is None else clock.clock),
+        "samples": samples,
+        "duration": duration_s,
+        "damage": None
+        if damage is None
+        else {"trusted": damage.trusted, "suspect": damage.suspect, "lost": damage.lost},
+        "damage_reason": _DAMAGE_UNKNOWN if damage is None else "",
+        "notes": notes,
+    }
+
+
+def _leading_clock(clocks: Sequence[ClockStatistics]) -> ClockStatistics | None:
+    """Statistics of the motor position, the one signal that every recording has."""
+    by_signal = {clock.signal: clock for clock in clocks}
+    return by_signal.get("motor_position", clocks[0] if clocks else None)
+
+
+def _clock_reason(recording: Recording, clock: str) -> str:
+    """Why the clock was chosen: the step of the history that names it, ``clock: NAME (reason)``."""
+    steps = [step.removeprefix(_CLOCK_STEP) for step in recording.history if step.startswith(_CLOCK_STEP)]
+    if not steps:
+        return ""
+    named = f"{clock} ("
+    return steps[0][len(named) : -1] if steps[0].startswith(named) and steps[0].endswith(")") else steps[0]
+
+
+def _recording(recording: Recording) -> dict[str, Any]:
+    return {
+        "sample_rate_hz": recording.sample_rate_hz,
+        "segments": len(recording.segments),
+        "samples": recording.samples,
+        "duration_s": recording.duration_s,
+        "linear": recording.linear,
+        "torque_unit": recording.torque_unit,
+        "clocks": [_clock(clock) for clock in recording.clocks],
+        "history": [step for step in recording.history if not step.startswith(_CLOCK_STEP)],
+    }
+
+
+def _clock(clock: ClockStatistics) -> dict[str, Any]:
+    """Statistics of one signal's stamps; the clock's name, which the container sets, stands under inputs."""
+    return {
+        "signal": clock.signal,
+        "samples": clock.samples,
+        "period_s": clock.period_s,
+        "jitter_s": clock.jitter_s,
+        "gaps": clock.gaps,
+        "lost_s": clock.lost_s,
+        "bridged": clock.bridged,
+        "duplicates": clock.duplicates,
+        "reordered": clock.reordered,
+        "resets": clock.resets,
+        "invalid": clock.invalid,
+    }
+
+
+def _model(model: ModelResult) -> dict[str, Any]:
+    return {
+        "id": model.id,
+        "method": model.method,
+        "method_reason": model.method_reason,
+        "equation": model.equation,
+        "added_terms": model.added_terms,
+        "parameters": [_parameter(estimate) for estimate in model.parameters],
+        "regression": [_parameter(estimate) for estimate in model.regression],
+        "derived": [_parameter(estimate) for estimate in model.derived],
+        "correlation": {"names": model.correlation_names, "matrix": _matrix(model.correlation)},
+        "condition_number": model.condition_number,
+        "rank": model.rank,
+        "columns": model.columns,
+        "fit": _fit(model.fit),
+        "pipeline": _pipeline(model.pipeline),
+        "tests": model.tests,
+        "warnings": model.warnings,
+    }
+
+
+def _parameter(estimate: Estimate) -> dict[str, Any]:
+    value, stderr = _finite(estimate.value), _finite(estimate.stderr)
+    ci = _interval(estimate.interval)
+    verdict, reason = _verdict(estimate, value, stderr, ci)
+    has_value = value is not None
+    return {
+        "name": estimate.name,
+        "symbol": estimate.symbol,
+        "unit": estimate.unit,
+        "estimate": value,
+        "stderr": stderr if has_value else None,
+        "ci": ci if has_value else None,
+        "relative_stderr_percent": _finite(estimate.relative_stderr_percent) if has_value else None,
+        "verdict": verdict,
+        "reason": reason,
+    }
+
+
+def _verdict(
+    estimate: Estimate, value: float | None, stderr: float | None, ci: dict[str, Any] | None
+) -> tuple[str, str]:
+    """Return verdict and reason, never better than what the numbers themselves allow."""
+    if value is None:
+        return "not_identifiable", estimate.reason or _NO_ESTIMATE
+    if estimate.verdict == "identified":
+        bounded = ci is not None and ci["low"] is not None and ci["high"] is not None
+        if stderr is None or not bounded:
+            return "weak", estimate.reason or _NO_INTERVAL
+        return "identified", estimate.reason
+    return estimate.verdict, estimate.reason or _NO_REASON
+
+
+def _interval(interval: Interval | None) -> dict[str, Any] | None:
+    """Return the interval; a bound that is not finite is None, and no interval is left without any bound."""
+    if interval is None:
+        return None
+    low, high = _finite(interval.low), _finite(interval.high)
+    if low is None and high is None:
+        return None
+    return {"low": low, "high": high, "level": interval.level, "method": interval.method}
+
+
+def _matrix(matrix: NDArray[np.float64]) -> list[list[float | None]]:
+    return [[_finite(float(cell)) for cell in row] for row in np.atleast_2d(matrix)] if matrix.size else []
+
+
+def _fit(fit: Fit) -> dict[str, Any]:
+    return {
+        "torque_rms": fit.torque_rms,
+        "residual_rms": fit.residual_rms,
+        "fit_percent": fit.fit_percent,
+        "unit": fit.unit,
+        "held_out": None,
+    }
+
+
+def _pipeline(pipeline: PipelineSummary) -> dict[str, Any]:
+    low_hz, high_hz = pipeline.effective_band_hz
+    return {
+        "sample_rate_hz": pipeline.sample_rate_hz,
+        "steps": pipeline.steps,
+        "lowpass": {"order": pipeline.lowpass_order, "cutoff_hz": pipeline.lowpass_cutoff_hz},
+        "derivative": pipeline.derivative,
+        "decimation": pipeline.decimation,
+        "effective_band_hz": {"low": low_hz, "high": high_hz},
+        "limited_by": pipeline.limited_by,
+        "sign_cutoff_hz": pipeline.sign_cutoff_hz,
+        "reversal_velocity": pipeline.reversal_velocity,
+        "rows": pipeline.rows,
+        "trimmed_s": pipeline.trimmed_s,
+        "f1_hz": pipeline.f1_hz,
+        "f1_source": pipeline.f1_source,
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _plain(value: Any) -> Any:
+    """Turn what results hold into data that JSON can hold."""
+    match value:
+        case None | bool() | int():
+            return value
+        case float():
+            return _finite(value)
+        case str():
+            return _writable(value)
+        case Mapping():
+            return {_writable(str(key)): _plain(item) for key, item in value.items()}
+        case np.generic() | np.ndarray():
+            return _plain(value.tolist())
+        case Sequence():
+            return [_plain(item) for item in value]
+        case _:
+            message = f"{type(value).__name__} has no place in a report"
+            raise TypeError(message)
+
+
+def _writable(text: str) -> str:
+    """Return ``text`` as UTF-8 can hold it: a file name that is not UTF-8 has half characters."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")

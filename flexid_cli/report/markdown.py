@@ -1,0 +1,265 @@
+"""The report as Markdown that GitHub, GitLab and pandoc show alike: plain tables, no HTML."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import TYPE_CHECKING, Any
+
+from flexid_cli.report import words
+from flexid_cli.report.numbers import MISSING, format_significant
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+FIGURE_KINDS = ("torque", "filter", "spectrum")
+_SMALLEST_P_VALUE = 0.001
+_CLOCK_COUNTS = ("gaps", "bridged", "duplicates", "reordered", "resets", "invalid")
+_SPECIAL = re.compile(r"[\\`*\[\]<>|~^$&#]|(?<![^\W_])_|_(?![^\W_])|^[-+=]")
+_LIST_NUMBER = re.compile(r"^(\d+)([.)])(?=\s|$)")
+
+
+def render_markdown(document: Mapping[str, Any], figures: Mapping[str, str]) -> str:
+    """Write the report for people, most important first.
+
+    Parameters
+    ----------
+    document : mapping
+        From `build_document`.
+    figures : mapping of str to str
+        Link of each figure by ``<model>_<kind>`` (``two_encoders_torque``), relative to the Markdown file. A
+        figure without a link is left out.
+    """
+    models = document["models"]
+    blocks = [f"# Drive parameters of {escape(words.axis_name(document))}", *_verdict(document)]
+    for model in models:
+        blocks += [f"## Model {model['id']}", *_results(model), *_figures(model, figures)]
+    blocks += [*_warnings(document), *_data_quality(document)]
+    blocks += [*_pipelines(models), *_methods(models), *_reproducibility(document)]
+    return "\n\n".join(blocks) + "\n"
+
+
+def escape(text: str) -> str:
+    """Escape what Markdown, GitHub's tables and mathematics, or pandoc's extensions would interpret."""
+    one_line = " ".join(str(text).split())
+    escaped = _SPECIAL.sub(lambda match: "\\" + match.group(0), one_line)
+    return _LIST_NUMBER.sub(r"\1\\\2", escaped)
+
+
+def _verdict(document: Mapping[str, Any]) -> list[str]:
+    lines = [f"**{escape(m['id'])}**: {escape(words.verdict_sentence(m))}" for m in document["models"]]
+    lines += [f"**{escape(s['id'])}** was not solved: {escape(s['reason'])}" for s in document["skipped"]]
+    if not lines:
+        lines = ["No model was solved."]
+    legend = "; ".join(f"*{words.VERDICTS[key]}*: {text}" for key, text in words.EXPLANATIONS.items())
+    return ["## Verdict", _bullets(lines), f"Here {legend}."]
+
+
+def _results(model: Mapping[str, Any]) -> list[str]:
+    blocks = ["### Parameters", *_estimates(model["parameters"])]
+    reasons = words.reasons([*model["parameters"], *model["regression"], *model["derived"]])
+    if reasons:
+        lines = [f"**{escape(name)}** ({verdict}): {escape(reason)}" for name, verdict, reason in reasons]
+        blocks += ["### Reasons", _bullets(lines)]
+    if model["regression"]:
+        blocks += ["### Regression", *_estimates(model["regression"])]
+    if model["derived"]:
+        blocks += ["### Derived quantities", *_estimates(model["derived"])]
+    return [*blocks, "### Fit", escape(words.fit_sentence(model)), *_tests(model), *_correlations(model)]
+
+
+def _estimates(parameters: Sequence[Mapping[str, Any]]) -> list[str]:
+    header = words.interval_header(parameters)
+    interval_title = header[0].upper() + header[1:]
+    titles = ("Symbol", "Name", "Estimate", interval_title, "Unit", "Rel. std. dev. %", "Verdict")
+    rows = []
+    for parameter in parameters:
+        estimate, interval, relative = words.estimate_cells(parameter, with_level=header == "interval")
+        verdict = words.VERDICTS[parameter["verdict"]]
+        symbol, unit = escape(parameter["symbol"]), escape(words.unit_cell(parameter))
+        rows.append((symbol, escape(parameter["name"]), estimate, interval, unit, relative, verdict))
+    return [_table(titles, "llrrlrl", rows)]
+
+
+def _tests(model: Mapping[str, Any]) -> list[str]:
+    if not model["tests"]:
+        return []
+    lines = [f"{escape(_phrase(name))}: {escape(_facts(test))}" for name, test in model["tests"].items()]
+    return ["Tests of the result:", _bullets(lines)]
+
+
+def _facts(test: Mapping[str, Any]) -> str:
+    """Name and value of each entry of a test, nested ones left to the JSON."""
+    simple = {key: value for key, value in test.items() if not isinstance(value, dict | list)}
+    return ", ".join(f"{_phrase(key)} {_value(key, value)}" for key, value in simple.items()) or MISSING
+
+
+def _phrase(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def _value(key: str, value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return MISSING
+    if not isinstance(value, int | float):
+        return _phrase(str(value))
+    return "below 0.001" if key == "p_value" and value < _SMALLEST_P_VALUE else format_significant(value)
+
+
+def _correlations(model: Mapping[str, Any]) -> list[str]:
+    pairs = words.strong_correlations(model)
+    if not pairs:
+        return []
+    lines = [f"{escape(a)} and {escape(b)}: {format_significant(value, 3)}" for a, b, value in pairs]
+    return ["Estimates that this record hardly tells apart (correlation):", _bullets(lines)]
+
+
+def _figures(model: Mapping[str, Any], figures: Mapping[str, str]) -> list[str]:
+    links = {kind: figures.get(f"{model['id']}_{kind}") for kind in FIGURE_KINDS}
+    images = [f"![{escape(words.finding(model, kind))}]({link})" for kind, link in links.items() if link]
+    return ["### Figures", *images] if images else []
+
+
+def _warnings(document: Mapping[str, Any]) -> list[str]:
+    lines = [escape(warning) for warning in document["warnings"]]
+    for model in document["models"]:
+        lines += [escape(warning) for warning in words.model_warnings(model)]
+    return ["## Warnings", _bullets(lines)] if lines else []
+
+
+def _data_quality(document: Mapping[str, Any]) -> list[str]:
+    recording = document["recording"]
+    count, unit = recording["segments"], recording["torque_unit"]
+    pieces = "one piece without a gap" if count == 1 else f"{count} pieces without gaps"
+    summary = (
+        f"{recording['samples']} samples at {format_significant(recording['sample_rate_hz'], 6)} Hz over "
+        f"{words.duration(recording['duration_s'])}, in {pieces}; {words.quantity(unit)} in {unit}."
+    )
+    blocks = ["## Data quality", escape(summary)]
+    if recording["clocks"]:
+        counts = (key.capitalize() for key in _CLOCK_COUNTS)
+        titles = ("Signal", "Samples", "Period", "Jitter", "Lost", *counts)
+        rows = [_clock_row(clock) for clock in recording["clocks"]]
+        blocks += [_table(titles, "lrrrr" + "r" * len(_CLOCK_COUNTS), rows), _clock_legend()]
+    notes = [line for entry in document["inputs"] for line in _input_notes(entry)]
+    return [*blocks, _bullets(notes)] if notes else blocks
+
+
+def _input_notes(entry: Mapping[str, Any]) -> list[str]:
+    notes, damage = words.input_notes(entry), entry["damage"]
+    if damage is not None and (damage["suspect"] or damage["lost"]):
+        counts = ", ".join(f"{count} {kind}" for kind, count in damage.items())
+        notes.insert(0, f"{entry['path']}: damaged file, samples: {counts}")
+    return [escape(note) for note in notes]
+
+
+def _clock_row(clock: Mapping[str, Any]) -> tuple[str, ...]:
+    times = (words.duration(clock[key]) for key in ("period_s", "jitter_s", "lost_s"))
+    counts = (str(clock[key]) for key in _CLOCK_COUNTS)
+    return (escape(clock["signal"]), str(clock["samples"]), *times, *counts)
+
+
+def _clock_legend() -> str:
+    return (
+        "Period and jitter are median and standard deviation of the time between stamps. Gaps split the "
+        "record (lost is their time); bridged samples were interpolated; duplicates were dropped; reordered "
+        "samples were put back; resets are jumps back of the clock; invalid samples are no finite numbers."
+    )
+
+
+def _pipelines(models: Sequence[Mapping[str, Any]]) -> list[str]:
+    blocks = ["## Pipeline"] if models else []
+    for model in models:
+        steps = [escape(step) for step in model["pipeline"]["steps"]]
+        sentences = (words.band_sentence(model), words.resonance_sentence(model), _rows(model["pipeline"]))
+        blocks += [f"### {escape(model['id'])}: pipeline", *([_numbered(steps)] if steps else [])]
+        blocks.append(escape(" ".join(sentence for sentence in sentences if sentence)))
+    return blocks
+
+
+def _rows(pipeline: Mapping[str, Any]) -> str:
+    text = f"{pipeline['rows']} rows of each equation were solved"
+    if pipeline["trimmed_s"]:
+        text += f", after {words.duration(pipeline['trimmed_s'])} were cut off at each edge"
+    return text + "."
+
+
+def _methods(models: Sequence[Mapping[str, Any]]) -> list[str]:
+    blocks = ["## Method"] if models else []
+    for model in models:
+        blocks += [f"### {escape(model['id'])}: method", _code(model["equation"])]
+        blocks.append(_bullets(_method_lines(model)))
+    return blocks
+
+
+def _method_lines(model: Mapping[str, Any]) -> list[str]:
+    estimator = f"Estimator: {escape(model['method'])}"
+    lines = [f"{estimator}, {escape(model['method_reason'])}" if model["method_reason"] else estimator]
+    methods = {p["ci"]["method"]: None for p in model["parameters"] if p["ci"] is not None}
+    if methods:
+        lines.append("Intervals: " + ", ".join(escape(method) for method in methods))
+    condition = format_significant(model["condition_number"])
+    lines.append(f"Condition number {condition} (columns scaled), rank {model['rank']} of {model['columns']}")
+    if model["added_terms"]:
+        terms = ", ".join(escape(_phrase(term)) for term in model["added_terms"])
+        lines.append(f"Added beyond the declared baseline: {terms}")
+    return lines
+
+
+def _reproducibility(document: Mapping[str, Any]) -> list[str]:
+    tool, config = document["tool"], document["config"]
+    lines = [f"{tool['name']} {tool['version']}, report format {document['schema']}"]
+    lines += [_input_line(entry) for entry in document["inputs"]]
+    lines.append(f"Configuration: SHA-256 `{config['sha256']}`")
+    blocks = ["## Reproducibility", _bullets(lines)]
+    if config["resolved"]:
+        settings = "\n".join(_settings(config["resolved"]))
+        blocks += ["The configuration with all defaults filled in:", _code(settings)]
+    if document["citations"]:
+        blocks += ["## References", _bullets(escape(citation) for citation in document["citations"])]
+    return blocks
+
+
+def _input_line(entry: Mapping[str, Any]) -> str:
+    facts = [entry["format"]]
+    if entry["clock"]:
+        reason = f" ({entry['clock_reason']})" if entry["clock_reason"] else ""
+        facts.append(f"clock {entry['clock']}{reason}")
+    if entry["samples"] is not None:
+        facts.append(f"{entry['samples']} samples")
+    if entry["duration"] is not None:
+        facts.append(words.duration(entry["duration"]))
+    return f"Input {escape(entry['path'])} ({escape(', '.join(facts))}): SHA-256 `{entry['sha256']}`"
+
+
+def _settings(value: object, path: str = "") -> Iterable[str]:
+    """One line for each setting: ``axis.gear_ratio = 50``."""
+    if isinstance(value, dict) and value:
+        for key, item in value.items():
+            yield from _settings(item, f"{path}.{key}" if path else str(key))
+    else:
+        yield f"{path} = {json.dumps(value, ensure_ascii=False)}"
+
+
+def _table(titles: Sequence[str], alignment: str, rows: Sequence[Sequence[str]]) -> str:
+    """Pipe table; ``alignment`` has l or r for each column. Cells are escaped by the caller."""
+    rules = ["---:" if side == "r" else ":---" for side in alignment]
+    lines = [titles, rules, *([cell or MISSING for cell in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _bullets(lines: Iterable[str]) -> str:
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def _numbered(lines: Iterable[str]) -> str:
+    return "\n".join(f"{number}. {line}" for number, line in enumerate(lines, start=1))
+
+
+def _code(text: str) -> str:
+    """Fenced block whose fence is longer than any run of backticks in the text."""
+    longest = max((len(run) for run in re.findall(r"`+", text)), default=0)
+    fence = "`" * max(3, longest + 1)
+    return f"{fence}text\n{text}\n{fence}"

@@ -1,0 +1,593 @@
+"""From files and a configuration to a `Recording`: read, choose the clock, convert, align."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flexid_cli.errors import DataError, InputError, UsageError
+from flexid_cli.readers.base import RawChannel, RawLog
+from flexid_cli.signals.convert import Converted, convert_position, convert_torque
+from flexid_cli.signals.recording import Array, Recording, Segment
+from flexid_cli.signals.resample import PASS_BAND, STOP_DB, Resampled, resample
+from flexid_cli.signals.timebase import (
+    NS,
+    BoolArray,
+    IntArray,
+    Timeline,
+    Track,
+    build_timelines,
+    choose_clock,
+    common_intervals,
+    fixed_rate_stamps,
+    grid_instants,
+    make_track,
+    to_nanoseconds,
+)
+from flexid_cli.units import Unit, parse_unit
+
+if TYPE_CHECKING:
+    from flexid_cli.config.schema import Config, PositionSignal, TorqueSignal
+
+DEFAULT_TORQUE_HOLD = "instant"
+MIN_SEGMENT_SAMPLES = 32
+POSITIONS = ("motor_position", "joint_position", "reference_position")
+FASTEST_TURN = 1e4  # rad/s at the encoder; spindles end near it
+FASTEST_SLIDE = 100.0  # m/s
+MOTION_TOLERANCE = 0.02
+MOTION_BLOCKS = 200
+_TIME_NAME = re.compile(
+    r"(?:\w*?[_. ])?(?:time|t|timestamp|time_?stamp|stamp|zeit|seconds?|secs?|epoch|clock)"
+    r"(?:[_. ]?(?:s|sec|secs|seconds?|ms|msec|us|µs|usec|ns|nsec|nanos|millis|micros))?"
+)
+_UNIT_SUFFIX = re.compile(r"(?:[_. (\[]+)(s|sec|seconds?|ms|msec|us|µs|usec|ns|nsec)[)\] ]*$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """One clock for all signals, before it is cleaned."""
+
+    name: str
+    reason: str
+    stamps: Mapping[str, tuple[IntArray, BoolArray | None]]
+
+
+@dataclass(frozen=True)
+class _Signal:
+    """One signal in joint-side SI, on its own stamps."""
+
+    track: Track
+    converted: Converted
+    source: str
+
+
+def build_recording(paths: Sequence[Path], config: Config) -> tuple[Recording, RawLog]:
+    """Read the signals that the configuration names, and bring them to one joint-side SI recording.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        All files of one run.
+    config : Config
+        The axis and its signals.
+
+    Returns
+    -------
+    recording : Recording
+        Uniform samples in gap-free segments.
+    raw : RawLog
+        What was read, for the report's inputs.
+
+    Raises
+    ------
+    InputError
+        A channel or the clock is missing, has less than two samples, or its side, gear or sign contradicts
+        another signal.
+    DataError
+        The signals never overlap in time, or one of them never changes.
+    """
+    raw, time = _read(paths, config)
+    return recording_from_raw(raw, config, time), raw
+
+
+def recording_from_raw(raw: RawLog, config: Config, time: RawChannel | None = None) -> Recording:
+    """Bring channels that have been read to a recording; see `build_recording`.
+
+    Parameters
+    ----------
+    raw : RawLog
+        Channels by the sources of the configuration.
+    config : Config
+        The axis and its signals.
+    time : RawChannel, optional
+        Channel of times, where the log's own clocks are not used.
+    """
+    sources = _sources(config)
+    channels = {role: raw.channels[source] for role, source in sources.items()}
+    clock = _choose(channels, config, time)
+    timelines = _clean(clock, _max_gap(config))
+    signals = _convert_all(channels, sources, timelines, clock.name, config)
+    for signal in signals.values():
+        _require_motion(signal)
+    history = [f"clock: {clock.name} ({clock.reason})", *_describe_signals(signals)]
+    signals = {role: _delayed(role, signal, config, history) for role, signal in signals.items()}
+    segments, rate, notes, duration = _align(signals, config, history)
+    notes += _check_motions(segments, config)
+    return Recording(
+        sample_rate_hz=rate,
+        segments=segments,
+        linear=config.linear,
+        torque_unit=signals[config.signals.torque_role].converted.unit,
+        duration_s=duration,
+        clocks=tuple(signal.track.statistics for signal in signals.values()),
+        history=tuple(history),
+        notes=(
+            *(note.message for note in raw.notes),
+            *_unit_notes(channels, config, time),
+            *_signal_notes(signals, timelines, config),
+            *notes,
+        ),
+    )
+
+
+def _given_sources(config: Config) -> list[str | int]:
+    return list(dict.fromkeys(getattr(config.signals, role).source for role in _roles(config)))
+
+
+def _roles(config: Config) -> list[str]:
+    roles = (config.signals.torque_role, *POSITIONS)
+    return [role for role in roles if getattr(config.signals, role) is not None]
+
+
+def _sources(config: Config) -> dict[str, str]:
+    return {role: str(getattr(config.signals, role).source) for role in _roles(config)}
+
+
+def _max_gap(config: Config) -> float | None:
+    return config.signals.time.max_gap_s if config.signals.time else None
+
+
+# --- reading ------------------------------------------------------------
+
+
+def _read(paths: Sequence[Path], config: Config) -> tuple[RawLog, RawChannel | None]:
+    """Return the log, and the channel that holds its times where these are not the log's own stamps."""
+    from flexid_cli.readers.registry import open_reader, read_log
+
+    time = config.signals.time
+    source = _time_source(paths, config, is_csv=open_reader(paths, csv=config.csv).name == "csv")
+    raw = read_log(paths, _given_sources(config), csv=config.csv, time_source=source)
+    rate = None if time is None else time.rate_hz
+    return raw, None if source is None or rate is not None else raw.channels.get(str(source))
+
+
+def _time_source(paths: Sequence[Path], config: Config, *, is_csv: bool) -> str | int | None:
+    """Choose what to read as time: the configured source, for CSV else the column that looks like it."""
+    from flexid_cli.readers.registry import list_channels
+
+    time = config.signals.time
+    if time is not None and (time.source is not None or time.rate_hz is not None):
+        return time.source
+    if not is_csv:
+        return None
+    names = [info.source for info in list_channels(paths, csv=config.csv)]
+    source = find_time_column(names)
+    if source is None:
+        raise InputError(
+            f"no column of {paths[0]} looks like time; columns: {', '.join(names)}",
+            "name the time column in signals.time.source, or give signals.time.rate_hz",
+        )
+    return source
+
+
+def find_time_column(names: Sequence[str]) -> str | None:
+    """Find the column that looks like time: ``time``, ``t``, ``timestamp [ms]``, ``time_ns``."""
+    plain = [re.sub(r"\s*[(\[{].*$", "", name).strip().lower() for name in names]
+    for wanted in (r"(?:time|t)", _TIME_NAME):
+        for name, text in zip(names, plain, strict=True):
+            if re.fullmatch(wanted, text):
+                return name
+    return None
+
+
+def time_unit_of(channel: RawChannel) -> str:
+    """Return the unit of a time column: what the log declares, else what its name ends in, else s."""
+    if channel.unit is not None:
+        return channel.unit
+    suffix = _UNIT_SUFFIX.search(channel.source)
+    return suffix.group(1).lower() if suffix else "s"
+
+
+# --- clock ------------------------------------------------------------
+
+
+def _choose(channels: Mapping[str, RawChannel], config: Config, time: RawChannel | None) -> _Clock:
+    settings = config.signals.time
+    if settings is not None and settings.rate_hz is not None:
+        rate = settings.rate_hz
+        _require_equal_length(
+            channels, max(c.values.size for c in channels.values()), f"the rate of {rate:g} Hz"
+        )
+        stamps = {role: (fixed_rate_stamps(c.values.size, rate), None) for role, c in channels.items()}
+        return _Clock("fixed_rate", f"{rate:g} Hz, configured", stamps)
+    if time is not None:
+        _require_equal_length(channels, time.values.size, f"the time channel {time.source!r}")
+        nanoseconds, valid = _column_stamps(time, config)
+        chosen = (
+            "configured"
+            if settings is not None and settings.source is not None
+            else "its name is that of a time"
+        )
+        return _Clock("column", f"{time.source}, {chosen}", dict.fromkeys(channels, (nanoseconds, valid)))
+    wanted = None if settings is None or settings.source is None else str(settings.source)
+    name, reason = choose_clock({role: channel.stamps for role, channel in channels.items()}, wanted)
+    return _Clock(name, reason, {role: (channel.stamps[name], None) for role, channel in channels.items()})
+
+
+def _require_equal_length(channels: Mapping[str, RawChannel], samples: int, clock: str) -> None:
+    for role, channel in channels.items():
+        if channel.values.size != samples:
+            raise InputError(
+                f"{clock} cannot be that of {role}: {channel.values.size} samples instead of {samples}",
+                "use a clock that was recorded with every signal: header_stamp or log_time",
+            )
+
+
+def _column_stamps(time: RawChannel, config: Config) -> tuple[IntArray, BoolArray]:
+    unit = _time_unit(time, config)
+    factor = round(unit.factor * NS)
+    if time.exact is not None and np.abs(time.exact).max(initial=0) < 2**63 // factor:
+        return time.exact * np.int64(factor), np.ones(time.exact.size, dtype=np.bool_)
+    stamps, valid = to_nanoseconds(time.values, unit.factor)
+    beyond = np.count_nonzero(np.isfinite(time.values) & ~valid)
+    if beyond:
+        raise InputError(
+            f"{beyond} times of {time.source!r} in {unit.name} lie beyond the year 2262",
+            "correct signals.time.unit",
+        )
+    return stamps, valid
+
+
+def _time_unit(time: RawChannel, config: Config) -> Unit:
+    settings = config.signals.time
+    if settings is not None and "unit" in settings.model_fields_set:
+        return parse_unit(settings.unit)
+    try:
+        unit = parse_unit(time_unit_of(time))
+    except UsageError:
+        unit = parse_unit("s")
+    return unit if unit.dimension == "time" else parse_unit("s")
+
+
+def _clean(clock: _Clock, max_gap_s: float | None) -> dict[str, Timeline]:
+    """Timelines of all signals; signals that share stamps share the work."""
+    distinct: list[tuple[str, IntArray, BoolArray | None]] = []
+    place: dict[str, int] = {}
+    for role, (stamps, valid) in clock.stamps.items():
+        for number, (_, other, _) in enumerate(distinct):
+            if other is stamps or np.array_equal(other, stamps):
+                place[role] = number
+                break
+        else:
+            place[role] = len(distinct)
+            distinct.append((role, stamps, valid))
+    timelines = build_timelines(distinct, max_gap_s)
+    return {role: timelines[number] for role, number in place.items()}
+
+
+# --- signals ------------------------------------------------------------
+
+
+def _convert_all(
+    channels: Mapping[str, RawChannel],
+    sources: Mapping[str, str],
+    timelines: Mapping[str, Timeline],
+    clock: str,
+    config: Config,
+) -> dict[str, _Signal]:
+    tracks = {
+        role: make_track(role, sources[role], clock, timelines[role], channel.values, _max_gap(config))
+        for role, channel in channels.items()
+    }
+    origin = min(int(track.stamps[0]) for track in tracks.values())
+    signals = {}
+    for role, track in tracks.items():
+        converted = _convert(role, track, config)
+        moved = replace(track, stamps=track.stamps - origin, values=converted.values)
+        signals[role] = _Signal(moved, converted, sources[role])
+    return signals
+
+
+def _convert(role: str, track: Track, config: Config) -> Converted:
+    if role not in POSITIONS:
+        return convert_torque(track.values, role, config.signals.torque, config.axis, linear=config.linear)
+    signal: PositionSignal = getattr(config.signals, role)
+    starts = np.asarray([first for first, _ in track.segments], dtype=np.int64)
+    return convert_position(track.values, role, signal, config, starts)
+
+
+def _require_motion(signal: _Signal) -> None:
+    track = signal.track
+    if track.name == "reference_position" or np.ptp(track.values) > 0.0:
+        return
+    raise DataError(
+        f"{track.name}: the channel {signal.source!r} never changes, it is {track.values[0]:g}"
+        f" {signal.converted.unit} (joint side) in all {track.values.size} samples",
+        "check signals." + track.name + ".source, or record while the axis moves",
+    )
+
+
+def _delayed(role: str, signal: _Signal, config: Config, history: list[str]) -> _Signal:
+    """Move stamps to the time at which the value was true."""
+    settings: TorqueSignal | PositionSignal = getattr(config.signals, role)
+    shift = 0
+    if settings.delay_s:
+        shift -= round(settings.delay_s * NS)
+        history.append(f"{role}: stamps moved by {-settings.delay_s:g} s, the configured delay")
+    if role not in POSITIONS:
+        half = round(0.5 * signal.track.period_ns)
+        if (config.signals.torque.hold or DEFAULT_TORQUE_HOLD) == "sample":
+            shift += half
+            history.append(
+                f"{role}: stamps moved {half / NS:g} s later, for each value is held for one sample"
+            )
+        else:
+            history.append(f"{role}: taken as measured at its stamp")
+    return (
+        replace(signal, track=replace(signal.track, stamps=signal.track.stamps + shift)) if shift else signal
+    )
+
+
+# --- alignment ------------------------------------------------------------
+
+
+def _align(
+    signals: Mapping[str, _Signal], config: Config, history: list[str]
+) -> tuple[tuple[Segment, ...], float, list[str], float]:
+    """Segments on the common grid, its rate in Hz, notes, and the duration in s."""
+    tracks = [signal.track for signal in signals.values()]
+    master = _slowest(signals)
+    grids = [grid_instants(master, start, stop) for start, stop in common_intervals(tracks)]
+    long = [grid for grid in grids if grid.size >= MIN_SEGMENT_SAMPLES]
+    if not long:
+        raise _no_common_time(tracks, max((grid.size for grid in grids), default=0))
+    origin = min(int(track.stamps[0]) for track in tracks)
+    kind = "its own stamps, which count as uniform" if master.is_uniform else "uniform, at its mean rate"
+    history.append(f"common grid: {NS / master.period_ns:g} Hz of {master.name} ({kind})")
+    resampled = {
+        role: [
+            resample(s.track, grid, master.period_ns, may_lowpass=role != "reference_position")
+            for grid in long
+        ]
+        for role, s in signals.items()
+    }
+    history += [_describe_resampling(signals[role].track, parts, master) for role, parts in resampled.items()]
+    segments = tuple(
+        _segment(
+            (grid[0] - origin) / NS, {role: parts[number].values for role, parts in resampled.items()}, config
+        )
+        for number, grid in enumerate(long)
+    )
+    lost = [grid for grid in grids if grid.size < MIN_SEGMENT_SAMPLES]
+    notes = []
+    if lost:
+        total = sum(grid.size for grid in lost)
+        notes.append(
+            f"{len(lost)} stretches shorter than {MIN_SEGMENT_SAMPLES} samples were left out, {total} samples"
+        )
+    return segments, NS / master.period_ns, notes, float(long[-1][-1] - long[0][0]) / NS
+
+
+def _slowest(signals: Mapping[str, _Signal]) -> Track:
+    """Return the signal whose rate is the common one. The reference never limits it."""
+    torque = next(role for role in signals if role not in POSITIONS)
+    tracks = [signals[role].track for role in ("motor_position", "joint_position", torque) if role in signals]
+    slowest = max(track.period_ns for track in tracks)
+    return next(track for track in tracks if track.period_ns >= slowest * (1.0 - 1e-3))
+
+
+def _no_common_time(tracks: Sequence[Track], longest: int) -> DataError:
+    spans = "; ".join(
+        f"{track.name} {track.stamps[0] / NS:.3f} to {track.stamps[-1] / NS:.3f} s" for track in tracks
+    )
+    if max(track.stamps[0] for track in tracks) > min(track.stamps[-1] for track in tracks):
+        return DataError(
+            f"the signals do not overlap in time: {spans}",
+            "check that they have the same clock (signals.time.source), and delay_s",
+        )
+    gaps = ", ".join(
+        f"{track.name} {track.statistics.gaps} (longer than {track.limit_ns / NS:g} s)"
+        for track in tracks
+        if track.statistics.gaps
+    )
+    return DataError(
+        f"no stretch of {MIN_SEGMENT_SAMPLES} samples without a gap is common to all signals; the longest has"
+        f" {longest} ({spans}" + (f"; gaps: {gaps})" if gaps else ")"),
+        "record longer, choose another clock, or raise signals.time.max_gap_s",
+    )
+
+
+def _segment(start_s: float, values: Mapping[str, Array], config: Config) -> Segment:
+    return Segment(
+        start_s=float(start_s),
+        torque=values[config.signals.torque_role],
+        motor_position=values["motor_position"],
+        joint_position=values.get("joint_position"),
+        reference_position=values.get("reference_position"),
+    )
+
+
+# --- words ------------------------------------------------------------
+
+
+def _describe_signals(signals: Mapping[str, _Signal]) -> list[str]:
+    lines = []
+    for role, signal in signals.items():
+        track, clock = signal.track, signal.track.statistics
+        uniform = "stamps count as uniform" if track.is_uniform else "stamps are irregular"
+        share = 100.0 * clock.jitter_s / clock.period_s
+        lines.append(
+            f"{role}: {clock.samples} samples of {signal.source!r}, {NS / track.period_ns:g} Hz,"
+            f" jitter {share:.2g} % of the period: {uniform}"
+        )
+        lines += [f"{role}: {step}" for step in signal.converted.steps]
+    return lines
+
+
+def _describe_resampling(track: Track, parts: Sequence[Resampled], master: Track) -> str:
+    total, copied = sum(part.values.size for part in parts), sum(part.copied for part in parts)
+    if parts[0].taps:
+        nyquist = 0.5 * NS / master.period_ns
+        return (
+            f"{track.name}: low-passed without delay (Kaiser FIR of {parts[0].taps} taps, flat to"
+            f" {PASS_BAND * nyquist:g} Hz, {STOP_DB:g} dB from {nyquist:g} Hz), then interpolated"
+        )
+    if copied == total:
+        return f"{track.name}: samples kept as they are"
+    return f"{track.name}: {total - copied} of {total} values interpolated by splines, the others kept"
+
+
+def _signal_notes(
+    signals: Mapping[str, _Signal], timelines: Mapping[str, Timeline], config: Config
+) -> list[str]:
+    notes: list[str] = []
+    for role, signal in signals.items():
+        notes += signal.converted.notes
+        notes += _damage_notes(role, signal.track)
+        notes += _speed_notes(role, signal.track, config)
+    quanta = {timeline.quantum_ns for timeline in timelines.values() if timeline.quantum_ns}
+    notes += [
+        f"stamps were rounded to {quantum / NS:g} s; the uniform clock behind them is used"
+        for quantum in sorted(quanta)
+    ]
+    return notes
+
+
+def _damage_notes(role: str, track: Track) -> list[str]:
+    clock = track.statistics
+    notes = []
+    if clock.gaps:
+        notes.append(
+            f"{role}: {clock.gaps} gaps longer than {track.limit_ns / NS:.4g} s, {clock.lost_s:.4g} s in all"
+        )
+    if clock.bridged:
+        notes.append(f"{role}: {clock.bridged} missing samples in short gaps are interpolated")
+    if clock.invalid:
+        notes.append(
+            f"{role}: {clock.invalid} of {clock.samples} samples without a number or a stamp were dropped"
+        )
+    if clock.duplicates:
+        notes.append(f"{role}: {clock.duplicates} samples with the stamp of another were dropped")
+    if clock.duplicates > 0.1 * clock.samples:
+        notes.append(
+            f"{role}: many stamps are equal, so the clock is too coarse: better give rate_hz"
+        )
+    if clock.reordered:
+        notes.append(f"{role}: {clock.reordered} samples were out of order and have been sorted")
+    if clock.resets:
+        notes.append(f"{role}: the clock jumped back {clock.resets} times; what follows stands behind a gap")
+    if not 1e-6 < clock.period_s < 0.5:
+        notes.append(
+            f"{role}: a sampling period of {clock.period_s:g} s is unusual; is the unit of time right?"
+        )
+    return notes
+
+
+def _speed_notes(role: str, track: Track, config: Config) -> list[str]:
+    if role not in POSITIONS:
+        return []
+    at_motor = getattr(config.signals, role).side == "motor"
+    steps = np.maximum(np.diff(track.stamps), 0.5 * track.period_ns)  # close stamps make noise a speed
+    speed = float(np.abs(np.diff(track.values) / steps).max()) * NS
+    speed *= config.axis.gear_ratio if at_motor else 1.0
+    limit, unit = (FASTEST_SLIDE, "m/s") if config.linear else (FASTEST_TURN, "rad/s")
+    if speed <= limit:
+        return []
+    return [
+        f"{role}: moves at up to {speed:.3g} {unit}, which is hardly possible;"
+        " are unit, scale and unwrap right?"
+    ]
+
+
+def _unit_notes(channels: Mapping[str, RawChannel], config: Config, time: RawChannel | None) -> list[str]:
+    pairs = [(role, channel.unit, getattr(config.signals, role).unit) for role, channel in channels.items()]
+    if time is not None:
+        pairs.append(("time", time.unit, _time_unit(time, config).name))
+    notes = []
+    for role, declared, configured in pairs:
+        if declared is None:
+            continue
+        try:
+            same = parse_unit(declared) == parse_unit(configured)
+        except UsageError:
+            continue
+        if not same:
+            notes.append(
+                f"{role}: the log declares {declared}, the configuration says {configured}, which is used"
+            )
+    return notes
+
+
+# --- plausibility ------------------------------------------------------------
+
+
+def _check_motions(segments: Sequence[Segment], config: Config) -> list[str]:
+    """Compare the two encoders' slow motion: a wrong side, gear, unit or sign shows as its ratio."""
+    pairs = [
+        (_slow(s.motor_position), _slow(s.joint_position)) for s in segments if s.joint_position is not None
+    ]
+    if not pairs:
+        return []
+    motor, joint = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
+    power = float(np.sqrt((motor @ motor) * (joint @ joint)))
+    if power == 0.0:
+        return []
+    correlation, ratio = float(motor @ joint) / power, float(np.sqrt((joint @ joint) / (motor @ motor)))
+    if abs(correlation) < 0.5:
+        words = f"motor_position and joint_position hardly move together (correlation {correlation:.2f})"
+        return [f"{words}; are they of one axis?"]
+    ratio = ratio if correlation > 0 else -ratio
+    if abs(ratio - 1.0) <= 0.05 or abs(correlation) < 0.9:
+        return []
+    cause = _cause_of(ratio, config) if abs(correlation) > 0.99 else None
+    text = f"at the joint side, joint_position moves {ratio:.5g} times as far as motor_position"
+    if cause is not None:
+        raise InputError(f"{text}; {cause[0]}", cause[1])
+    return [f"{text}; are gear_ratio, side, unit and sign right?"]
+
+
+def _slow(position: Array | None) -> Array:
+    """Means of up to 200 blocks, about their mean: what vibrates near a resonance averages out."""
+    if position is None:
+        return np.zeros(0)
+    block = max(1, position.size // MOTION_BLOCKS)
+    count = position.size // block
+    means = position[: count * block].reshape(count, block).mean(axis=1)
+    return np.asarray(means - means.mean())
+
+
+def _cause_of(ratio: float, config: Config) -> tuple[str, str] | None:
+    gear = config.axis.gear_ratio
+    factors = [(1.0, "their directions differ", "")]
+    if abs(gear - 1.0) > 0.05:
+        factors.append((gear, f"that is gear_ratio ({gear:g})", "is `side` or gear_ratio wrong?"))
+        factors.append((1.0 / gear, f"that is 1/gear_ratio (1/{gear:g})", "is `side` or gear_ratio wrong?"))
+    turns = [
+        (180.0 / np.pi, "deg per rad"),
+        (2.0 * np.pi, "rad per rev"),
+        (360.0, "deg per rev"),
+        (1e3, "thousand"),
+    ]
+    for factor, words in turns:
+        factors.append((factor, f"that is the factor {words}", "is one of the units wrong?"))
+        factors.append((1.0 / factor, f"that is one over the factor {words}", "is one of the units wrong?"))
+    for factor, cause, cure in factors:
+        if abs(abs(ratio) / factor - 1.0) <= MOTION_TOLERANCE:
+            turn = "set `sign: -1` on one of the two" if ratio < 0 else ""
+            return cause, "; ".join(part for part in (cure, turn) if part)
+    return None
