@@ -93,3 +93,32 @@ _UNITS = {
 def unit_of(quantity: str, *, linear: bool, torque_unit: str) -> str:
     """Unit of a quantity on a rotary or linear axis, with torque in N m (N) or in A."""
     return _UNITS[quantity][int(linear) + (2 if torque_unit == "A" else 0)]
+
+
+# How gravity enters a model without a joint encoder, by the form's name: parameters, columns, and text of the
+# equation, the constant torque first. Over a small motion cos q and sin q are no more than a constant and a slope,
+# so the offset cannot be told from the gravity torque at the middle of the motion, nor one moment from the other.
+GRAVITY_FORMS: dict[str, tuple[tuple[Parameter, ...], tuple[tuple[str, int], ...], str]] = {
+    "none": (
+        (Parameter("torque_offset", "offset", "torque", effect="torque_offset"),),
+        (("one", 0),),
+        " + offset",
+    ),
+    "spring": (
+        (
+            Parameter("constant_torque", "Q0", "torque", effect="gravity"),
+            Parameter("gravity_stiffness", "kg", "stiffness", effect="gravity"),
+        ),
+        (("one", 0), ("joint_centred", 0)),
+        " + Q0 + kg (q - q0)",
+    ),
+    "moments": (
+        (
+            Parameter("torque_offset", "offset", "torque", effect="torque_offset"),
+            Parameter("gravity_moment_x", "MX", "first_moment", effect="gravity"),
+            Parameter("gravity_moment_y", "MY", "first_moment", effect="gravity"),
+        ),
+        (("one", 0), ("gravity_cos", 0), ("gravity_sin", 0)),
+        " + offset + MX g cos q + MY g sin q",
+    ),
+}

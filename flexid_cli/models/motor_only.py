@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from flexid_cli.models.base import Block, Parameter
+from flexid_cli.models.base import GRAVITY_FORMS, Block, Parameter
 
 Array = NDArray[np.float64]
 
@@ -27,12 +27,6 @@ PHYSICAL = (
     Parameter("load_viscous_friction", "FV", "viscous", positive=True),
     Parameter("motor_coulomb_friction", "FSm", "torque", positive=True),
     Parameter("load_coulomb_friction", "FS", "torque", positive=True),
-)
-_OFFSET = Parameter("torque_offset", "offset", "torque", effect="torque_offset")
-_GRAVITY_SPRING = Parameter("gravity_stiffness", "kg", "stiffness", effect="gravity")
-_GRAVITY = (
-    Parameter("gravity_moment_x", "MX", "first_moment", effect="gravity"),
-    Parameter("gravity_moment_y", "MY", "first_moment", effect="gravity"),
 )
 _COLUMNS = (
     ("torque", 0), ("torque", 2), ("torque", 1),
@@ -101,25 +95,19 @@ class MotorOnly:
     Parameters
     ----------
     gravity : {"spring", "moments", "none"}
-        Gravity as a spring kg about the middle of the range (small motion), as MX g cos q + MY g sin q (wide
-        motion, where the two and the offset can be told apart), or none (a linear axis).
+        Key of `base.GRAVITY_FORMS`: gravity as a spring about the middle of a small motion, as two moments, or
+        none (a linear axis).
     """
 
     id = "motor_only"
 
     def __init__(self, gravity: str) -> None:
-        extra = {"spring": (_GRAVITY_SPRING,), "moments": _GRAVITY, "none": ()}[gravity]
-        columns = {
-            "spring": (("joint_centred", 0),),
-            "moments": (("gravity_cos", 0), ("gravity_sin", 0)),
-            "none": (),
-        }[gravity]
-        self.parameters = (*PHYSICAL, _OFFSET, *extra)
-        self.blocks = (Block("motor", (*_COLUMNS, ("one", 0), *columns)),)
-        gravity_text = {"spring": " + kg (q - q0)", "moments": " + MX g cos q + MY g sin q", "none": ""}[gravity]
+        extra, columns, text = GRAVITY_FORMS[gravity]
+        self.parameters = (*PHYSICAL, *extra)
+        self.blocks = (Block("motor", (*_COLUMNS, *columns)),)
         self.equation = (
             "Gm + X1 Gm'' + X2 Gm' = X3 qm'''' + X4 qm''' + X5 qm'' + X6 qm' + FSm (S + X2 S' + X1 S'')"
-            f" + FS sgn(q') + offset{gravity_text}, S = sgn(qm')"
+            f" + FS sgn(q'){text}, S = sgn(qm')"
         )
 
     def coefficients(self, theta: Array) -> tuple[Array]:

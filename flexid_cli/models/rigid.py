@@ -5,12 +5,17 @@ Gm = (Jm + JL) qm'' + FV qm' + FS sgn(qm') + offset + gravity
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from flexid_cli.models.base import Block, Parameter
+from flexid_cli.models.base import GRAVITY_FORMS, Block, Parameter
 
 Array = NDArray[np.float64]
+
+
+_COLUMNS = (("torque", 0), ("motor", 2), ("motor", 1), ("sign_motor", 0))
 
 
 class Rigid:
@@ -25,31 +30,16 @@ class Rigid:
     id = "rigid"
 
     def __init__(self, gravity: str) -> None:
-        extra = {
-            "spring": (Parameter("gravity_stiffness", "kg", "stiffness"),),
-            "moments": (
-                Parameter("gravity_moment_x", "MX", "first_moment"),
-                Parameter("gravity_moment_y", "MY", "first_moment"),
-            ),
-            "none": (),
-        }[gravity]
-        columns = {
-            "spring": (("joint_centred", 0),),
-            "moments": (("gravity_cos", 0), ("gravity_sin", 0)),
-            "none": (),
-        }[gravity]
+        extra, columns, text = GRAVITY_FORMS[gravity]
         self.parameters = (
             Parameter("total_inertia", "Jm+JL", "inertia", positive=True),
             Parameter("viscous_friction", "FVm+FV", "viscous", positive=True),
             Parameter("coulomb_friction", "FSm+FS", "torque", positive=True),
-            Parameter("torque_offset", "offset", "torque"),
-            *extra,
+            # The rigid baseline holds offset and gravity: they are no added effects here.
+            *(replace(p, effect="") for p in extra),
         )
-        self.blocks = (
-            Block("motor", (("torque", 0), ("motor", 2), ("motor", 1), ("sign_motor", 0), ("one", 0), *columns)),
-        )
-        gravity_text = {"spring": " + kg (q - q0)", "moments": " + MX g cos q + MY g sin q", "none": ""}[gravity]
-        self.equation = f"Gm = (Jm+JL) q'' + (FVm+FV) q' + (FSm+FS) sgn(q') + offset{gravity_text}"
+        self.blocks = (Block("motor", (*_COLUMNS, *columns)),)
+        self.equation = f"Gm = (Jm+JL) q'' + (FVm+FV) q' + (FSm+FS) sgn(q'){text}"
 
     def coefficients(self, theta: Array) -> tuple[Array]:
         """Coefficients of the columns, shape (1 + p,)."""

@@ -244,10 +244,9 @@ class _Topic:
         row = len(self._log)
         with decoding(path, f"message {row + 1} of topic {self.topic!r} at {message.log_time} ns"):
             content = decode(message.data)
-            stamp = stamp_ns(content)
-            self._log.append(message.log_time)
-            self._header = _extended(self._header, stamp)
-            self._publish = _extended(self._publish, message.publish_time)
+        self._log.append(message.log_time)
+        self._header = _extended(self._header, stamp_ns(content))
+        self._publish = _extended(self._publish, message.publish_time)
         for column in self.columns.values():
             column.take(content, row)
 

@@ -273,10 +273,9 @@ class _Table:
         """Keep the samples of whole lines, the first of which is line ``number`` of the file."""
         width, delimiter = len(self.dialect.fields), self.dialect.delimiter
         count = text.count("\n")
-        plain = width > 1 and number >= self.dialect.first_line and delimiter != WHITESPACE
-        odd = ('"', "\n\n", *self.dialect.comments)
-        # as many delimiters as whole lines have; one line too short beside one too long: the parser finds it
-        if plain and text.count(delimiter) == count * (width - 1) and not any(mark in text for mark in odd):
+        plain = number >= self.dialect.first_line and delimiter != WHITESPACE
+        odd = ('"', *self.dialect.comments)
+        if plain and not any(mark in text for mark in odd) and _is_even(text, delimiter, width):
             self._remember(text)
             return _Block(text, count, range(number, number + count))
         kept, lines = [], []
@@ -388,6 +387,19 @@ class _Table:
             f"correct the line, or leave the field empty; numbers are read with a {mark}, which "
             "`csv: {decimal: ...}` sets",
         )
+
+
+def _is_even(text: str, delimiter: str, width: int) -> bool:
+    """Whether each line has exactly ``width`` fields, and none is blank."""
+    marks = np.frombuffer(text.encode(), dtype=np.uint8)
+    ends = marks == ord("\n")
+    if width == 1 or ord(delimiter) > 127:
+        return False
+    marks = marks[ends | (marks == ord(delimiter))]
+    if marks.size % width:
+        return False
+    lines = marks.reshape(-1, width) == ord("\n")
+    return bool(lines[:, -1].all()) and not lines[:, :-1].any()
 
 
 def _exact_floats() -> Mapping[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 from flexid_cli.errors import InputError
@@ -47,6 +47,7 @@ class TopicType:
         return self.encoding == "cdr" and not self.schema.strip()
 
 
+@lru_cache(maxsize=64)
 def make_decoder(kind: TopicType) -> Decoder:
     """Return the function that decodes messages of ``kind``.
 

@@ -63,7 +63,7 @@ def stamp_ns(message: Any) -> int | None:
 
 
 def _stamp_parts(node: Any) -> tuple[int | None, int | None]:
-    if node is MISSING or node is None:
+    if node is MISSING or node is None or isinstance(node, str | bytes):
         return None, None
     for coarse, fine in _STAMP_FIELDS:
         seconds, nanoseconds = child(node, coarse), child(node, fine)
@@ -165,7 +165,7 @@ class Column:
         value = self._pick(message)
         if value is MISSING:
             return
-        if type(value) is float:
+        if isinstance(value, float):  # a numpy float64 is one too
             self._integers = None
         elif value is None:
             self._integers, value = None, float("nan")

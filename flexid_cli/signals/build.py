@@ -16,6 +16,7 @@ from flexid_cli.signals.convert import Converted, convert_position, convert_torq
 from flexid_cli.signals.recording import Array, Recording, Segment
 from flexid_cli.signals.resample import PASS_BAND, STOP_DB, Resampled, resample
 from flexid_cli.signals.timebase import (
+    CLOCKS,
     NS,
     BoolArray,
     IntArray,
@@ -55,6 +56,7 @@ class _Clock:
     name: str
     reason: str
     stamps: Mapping[str, tuple[IntArray, BoolArray | None]]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,7 @@ def recording_from_raw(raw: RawLog, config: Config, time: RawChannel | None = No
         history=tuple(history),
         notes=(
             *(note.message for note in raw.notes),
+            *clock.notes,
             *_unit_notes(channels, config, time),
             *_signal_notes(signals, timelines, config),
             *notes,
@@ -226,7 +229,10 @@ def _choose(channels: Mapping[str, RawChannel], config: Config, time: RawChannel
         return _Clock("column", f"{time.source}, {chosen}", dict.fromkeys(channels, (nanoseconds, valid)))
     wanted = None if settings is None or settings.source is None else str(settings.source)
     name, reason = choose_clock({role: channel.stamps for role, channel in channels.items()}, wanted)
-    return _Clock(name, reason, {role: (channel.stamps[name], None) for role, channel in channels.items()})
+    notes: tuple[str, ...] = ()
+    if wanted is None and name != CLOCKS[0]:
+        notes = (f"clock: {name}, for {reason}; its stamps hold the delays of the transport",)
+    return _Clock(name, reason, {role: (c.stamps[name], None) for role, c in channels.items()}, notes)
 
 
 def _require_equal_length(channels: Mapping[str, RawChannel], samples: int, clock: str) -> None:
@@ -307,8 +313,10 @@ def _convert(role: str, track: Track, config: Config) -> Converted:
     if role not in POSITIONS:
         return convert_torque(track.values, role, config.signals.torque, config.axis, linear=config.linear)
     signal: PositionSignal = getattr(config.signals, role)
-    starts = np.asarray([first for first, _ in track.segments], dtype=np.int64)
-    return convert_position(track.values, role, signal, config, starts)
+    steps = np.diff(track.stamps)
+    periods = np.maximum(np.rint(steps / track.period_ns), 1.0).astype(np.int64)
+    periods[steps > track.limit_ns] = 0
+    return convert_position(track.values, role, signal, config, periods)
 
 
 def _require_motion(signal: _Signal) -> None:
@@ -374,13 +382,25 @@ def _align(
         for number, grid in enumerate(long)
     )
     lost = [grid for grid in grids if grid.size < MIN_SEGMENT_SAMPLES]
-    notes = []
+    notes = _coverage_notes(tracks, sum(float(grid[-1] - grid[0]) for grid in long))
     if lost:
         total = sum(grid.size for grid in lost)
         notes.append(
             f"{len(lost)} stretches shorter than {MIN_SEGMENT_SAMPLES} samples were left out, {total} samples"
         )
     return segments, NS / master.period_ns, notes, float(long[-1][-1] - long[0][0]) / NS
+
+
+def _coverage_notes(tracks: Sequence[Track], used_ns: float) -> list[str]:
+    """Say which signal limits the record, where it costs the others a tenth of their time."""
+    covered = {
+        t.name: float(sum(t.stamps[stop - 1] - t.stamps[first] for first, stop in t.segments)) for t in tracks
+    }
+    longest, shortest = max(covered, key=covered.__getitem__), min(covered, key=covered.__getitem__)
+    if used_ns >= 0.9 * covered[longest]:
+        return []
+    used, most, least = (f"{time / NS:.4g} s" for time in (used_ns, covered[longest], covered[shortest]))
+    return [f"only {used} of the {most} of {longest} are common to all signals; {shortest} has {least}"]
 
 
 def _slowest(signals: Mapping[str, _Signal]) -> Track:
@@ -455,11 +475,13 @@ def _describe_resampling(track: Track, parts: Sequence[Resampled], master: Track
 def _signal_notes(
     signals: Mapping[str, _Signal], timelines: Mapping[str, Timeline], config: Config
 ) -> list[str]:
-    notes: list[str] = []
+    damage: dict[str, list[str]] = {}
     for role, signal in signals.items():
-        notes += signal.converted.notes
-        notes += _damage_notes(role, signal.track)
-        notes += _speed_notes(role, signal.track, config)
+        for text in _damage_of(signal.track):
+            damage.setdefault(text, []).append(role)
+    notes = [f"{', '.join(roles)}: {text}" for text, roles in damage.items()]
+    for role, signal in signals.items():
+        notes += [*signal.converted.notes, *_speed_notes(role, signal.track, config)]
     quanta = {timeline.quantum_ns for timeline in timelines.values() if timeline.quantum_ns}
     notes += [
         f"stamps were rounded to {quantum / NS:g} s; the uniform clock behind them is used"
@@ -468,34 +490,35 @@ def _signal_notes(
     return notes
 
 
-def _damage_notes(role: str, track: Track) -> list[str]:
+def _damage_of(track: Track) -> list[str]:
     clock = track.statistics
-    notes = []
-    if clock.gaps:
-        notes.append(
-            f"{role}: {clock.gaps} gaps longer than {track.limit_ns / NS:.4g} s, {clock.lost_s:.4g} s in all"
-        )
-    if clock.bridged:
-        notes.append(f"{role}: {clock.bridged} missing samples in short gaps are interpolated")
-    if clock.invalid:
-        notes.append(
-            f"{role}: {clock.invalid} of {clock.samples} samples without a number or a stamp were dropped"
-        )
-    if clock.duplicates:
-        notes.append(f"{role}: {clock.duplicates} samples with the stamp of another were dropped")
-    if clock.duplicates > 0.1 * clock.samples:
-        notes.append(
-            f"{role}: many stamps are equal, so the clock is too coarse: better give rate_hz"
-        )
-    if clock.reordered:
-        notes.append(f"{role}: {clock.reordered} samples were out of order and have been sorted")
-    if clock.resets:
-        notes.append(f"{role}: the clock jumped back {clock.resets} times; what follows stands behind a gap")
-    if not 1e-6 < clock.period_s < 0.5:
-        notes.append(
-            f"{role}: a sampling period of {clock.period_s:g} s is unusual; is the unit of time right?"
-        )
-    return notes
+    texts = [
+        (
+            clock.gaps,
+            f"{_count(clock.gaps, 'gap')} longer than {track.limit_ns / NS:.4g} s, {clock.lost_s:.4g} s in all",
+        ),
+        (clock.bridged, f"{_count(clock.bridged, 'missing sample')} interpolated in short gaps"),
+        (
+            clock.invalid,
+            f"{clock.invalid} of {clock.samples} samples without a number or a stamp were dropped",
+        ),
+        (clock.duplicates, f"{_count(clock.duplicates, 'sample')} with the stamp of another dropped"),
+        (
+            clock.duplicates > 0.1 * clock.samples,
+            "many stamps are equal, so the clock is too coarse: better give rate_hz",
+        ),
+        (clock.reordered, f"{_count(clock.reordered, 'sample')} out of order, now sorted"),
+        (clock.resets, f"{_count(clock.resets, 'jump')} back of the clock; what follows stands behind a gap"),
+        (
+            not 1e-6 < clock.period_s < 0.5,
+            f"a sampling period of {clock.period_s:g} s is unusual; is the unit of time right?",
+        ),
+    ]
+    return [text for happened, text in texts if happened]
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}" if number == 1 else f"{number} {word}s"
 
 
 def _speed_notes(role: str, track: Track, config: Config) -> list[str]:
@@ -508,10 +531,8 @@ def _speed_notes(role: str, track: Track, config: Config) -> list[str]:
     limit, unit = (FASTEST_SLIDE, "m/s") if config.linear else (FASTEST_TURN, "rad/s")
     if speed <= limit:
         return []
-    return [
-        f"{role}: moves at up to {speed:.3g} {unit}, which is hardly possible;"
-        " are unit, scale and unwrap right?"
-    ]
+    text = f"{role}: moves at up to {speed:.3g} {unit}, which is hardly possible"
+    return [f"{text}; are unit, scale and unwrap right?"]
 
 
 def _unit_notes(channels: Mapping[str, RawChannel], config: Config, time: RawChannel | None) -> list[str]:

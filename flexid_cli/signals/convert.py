@@ -98,7 +98,7 @@ def _from_current(current: Array, unit: str, axis: Axis, steps: list[str]) -> tu
 
 
 def convert_position(
-    raw: Array, role: str, signal: PositionSignal, config: Config, starts: IntArray | None = None
+    raw: Array, role: str, signal: PositionSignal, config: Config, periods: IntArray | None = None
 ) -> Converted:
     """Position at the joint side, in rad or m, without the jumps of an encoder that wraps.
 
@@ -110,8 +110,8 @@ def convert_position(
         ``motor_position``, ``joint_position`` or ``reference_position``.
     signal, config : PositionSignal, Config
         Of the configuration.
-    starts : ndarray of int, optional
-        First indices of segments: what the encoder did in the gap before them is not known.
+    periods : ndarray of int, shape (n - 1,), optional
+        Sampling periods from each sample to the next; 0 for gaps and resets, where nothing is known.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def convert_position(
     factor = _position_factor(role, signal, linear=config.linear)
     if factor != 1.0:
         steps.append(f"{signal.unit} to {'m' if config.linear else 'rad'}")
-    values, notes = _without_wraps(values, role, signal, TURN / factor, linear=config.linear, starts=starts)
+    values, notes = _without_wraps(values, role, signal, TURN / factor, linear=config.linear, periods=periods)
     values = values * factor
     if signal.side == "motor" and config.axis.gear_ratio != 1.0:
         values = values / config.axis.gear_ratio
@@ -146,26 +146,26 @@ def _position_factor(role: str, signal: PositionSignal, *, linear: bool) -> floa
 
 
 def _without_wraps(
-    values: Array, role: str, signal: PositionSignal, turn: float, *, linear: bool, starts: IntArray | None
+    values: Array, role: str, signal: PositionSignal, turn: float, *, linear: bool, periods: IntArray | None
 ) -> tuple[Array, list[str]]:
     if linear and signal.unwrap:
         raise InputError(f"signals.{role}.unwrap: a linear axis has no turn", "remove unwrap")
     if linear or signal.unwrap is False:
         return values, []
-    jumps = find_wraps(values, turn, certain=bool(signal.unwrap), starts=starts)
-    if jumps.size == 0:
+    turns = count_wraps(values, turn, certain=bool(signal.unwrap), periods=periods)
+    jumps = int(np.count_nonzero(turns))
+    if jumps == 0:
         return values, []
-    turns = np.zeros(values.size)
-    turns[jumps + 1] = -np.rint((values[jumps + 1] - values[jumps]) / turn)
     why = "as configured" if signal.unwrap else "found from the velocity; unwrap: false turns this off"
-    what = f"{jumps.size} jumps of a turn ({turn:g} {signal.unit})"
-    return values + turn * np.cumsum(turns), [f"{role}: the encoder wraps; {what} were removed, {why}"]
+    what = f"{jumps} jumps of a turn ({turn:g} {signal.unit})"
+    unwrapped = values - turn * np.concatenate(([0], np.cumsum(turns)))
+    return unwrapped, [f"{role}: the encoder wraps; {what} were removed, {why}"]
 
 
-def find_wraps(
-    values: Array, turn: float, *, certain: bool = False, starts: IntArray | None = None
+def count_wraps(
+    values: Array, turn: float, *, certain: bool = False, periods: IntArray | None = None
 ) -> IntArray:
-    """Find the indices i where the encoder wraps between sample i and i + 1.
+    """Count the turns by which an encoder wraps from one sample to the next.
 
     Parameters
     ----------
@@ -174,28 +174,38 @@ def find_wraps(
     turn : float
         One turn in their unit.
     certain : bool
-        Take every jump of more than half a turn. Otherwise only those that stand alone and whose removal
-        makes the velocity continuous: an axis that really moves that far per sample does so on both sides, too.
-    starts : ndarray of int, optional
-        First indices of segments; jumps into them are judged by their size alone, and only if others are
-        found.
+        Whether the encoder is known to wrap: then every jump of more than half a turn counts. Otherwise only
+        those that stand alone and whose removal makes the velocity continuous: an axis that really moves that
+        far per sample does so on both sides, too.
+    periods : ndarray of int, shape (n - 1,), optional
+        Sampling periods from each sample to the next: more than one where samples are missing, 0 where
+        nothing is known of the time between. Such steps are no evidence; if there is evidence elsewhere, they
+        are judged by the velocity on both sides.
+
+    Returns
+    -------
+    ndarray of int, shape (n - 1,)
+        Turns to take off each step; all zero where the encoder does not wrap.
     """
     steps = np.diff(values)
-    far = np.flatnonzero(np.abs(steps) > 0.5 * turn)
-    if certain or far.size == 0:
-        return far
+    periods = np.ones(steps.size, dtype=np.int64) if periods is None else periods
+    single = periods == 1
+    far = np.flatnonzero((np.abs(steps) > 0.5 * turn) | (periods > 1))
     short = steps - turn * np.rint(steps / turn)
     left, right = np.maximum(far - 1, 0), np.minimum(far + 1, steps.size - 1)
     left, right = np.where(far == 0, right, left), np.where(far == steps.size - 1, left, right)
-    alone = np.minimum(np.abs(steps[far] - steps[left]), np.abs(steps[far] - steps[right])) > 0.5 * turn
-    expected, spread = 0.5 * (short[left] + short[right]), np.abs(short[left] - short[right])
-    good = alone & (np.abs(short[far] - expected) < 0.1 * turn + 0.5 * spread)
-    within = (
-        np.isin(far + 1, starts, invert=True) if starts is not None else np.ones(far.size, dtype=np.bool_)
-    )
-    if np.count_nonzero(good & within) < max(1.0, WRAP_SHARE * np.count_nonzero(within)):
-        return far[:0]
-    return far[good | ~within]
+    speed = short / np.maximum(periods, 1)
+    expected, spread = 0.5 * (speed[left] + speed[right]), np.abs(speed[left] - speed[right])
+    turns = np.zeros(steps.size, dtype=np.int64)
+    if not certain:
+        alone = np.minimum(np.abs(steps[far] - steps[left]), np.abs(steps[far] - steps[right])) > 0.5 * turn
+        good = single[far] & alone & (np.abs(short[far] - expected) < 0.1 * turn + 0.5 * spread)
+        if np.count_nonzero(good) < max(1.0, WRAP_SHARE * np.count_nonzero(single[far])):
+            return turns
+        far, expected = far[good | ~single[far]], expected[good | ~single[far]]
+    guess = np.where(single[far], 0.0, expected * periods[far])
+    turns[far] = np.rint((steps[far] - guess) / turn).astype(np.int64)
+    return turns
 
 
 def _affine_steps(scale: float, offset: float, sign: int) -> list[str]:

@@ -150,15 +150,14 @@ def _clock_of(channel: RawChannel, time: _Stamps | None) -> _Stamps | None:
 
 
 def _duration(clocks: Iterable[_Stamps | None]) -> float | None:
-    ends: list[int] = []
-    seen: set[int] = set()
-    for clock in clocks:
-        if clock is None or id(clock[1]) in seen:
-            continue
-        seen.add(id(clock[1]))
-        line = build_timelines([clock])[0].stamps
-        ends += [int(line[0]), int(line[-1])] if line.size else []
-    return (max(ends) - min(ends)) / NS if ends else None
+    """Longest span of one clock; clocks of different names may have different zeros."""
+    spans: dict[str, tuple[int, int]] = {}
+    for stamps in {id(clock[1]): clock for clock in clocks if clock is not None}.values():
+        line = build_timelines([stamps])[0].stamps
+        if line.size:
+            low, high = spans.get(stamps[0], (int(line[0]), int(line[-1])))
+            spans[stamps[0]] = min(low, int(line[0])), max(high, int(line[-1]))
+    return max((high - low) / NS for low, high in spans.values()) if spans else None
 
 
 def _summary(info: ChannelInfo, channel: RawChannel, clock: _Stamps | None) -> ChannelSummary:

@@ -123,7 +123,9 @@ def guess_roles(inspection: Inspection) -> dict[str, ChannelSummary]:
         roles["motor_position"] = max(measured, key=lambda c: (c.moves, c.motor_score()))
         motor = roles["motor_position"]
         others = [
-            c for c in measured if c is not motor and c.words & _LOAD and _same_axis(c, motor, measured)
+            c
+            for c in measured
+            if c is not motor and (c.words | c.context) & _LOAD and _same_axis(c, motor, measured)
         ]
         if others:
             roles["joint_position"] = max(others, key=lambda c: (c.moves, -c.motor_score()))
@@ -184,10 +186,14 @@ def _shared_beginning(one: str, other: str) -> int:
 
 
 def _same_axis(one: _Candidate, motor: _Candidate, measured: Sequence[_Candidate]) -> bool:
-    """Whether two positions may be of one axis: several joints of one message are not."""
-    head = one.source.rpartition("/")[0].rpartition("/")[0]
-    siblings = [c for c in measured if head and c.source.startswith(head + "/")]
-    return len(siblings) <= 2 or not motor.source.startswith(head + "/")
+    """Whether two positions may be of one axis: those of several joints in one message are not.
+
+    ``/states/joint_1/position`` and ``/states/joint_2/position`` differ in a name that says nothing of a
+    side.
+    """
+    if one.words != motor.words:
+        return True
+    return bool((one.context ^ motor.context) & (_MOTOR | _LOAD)) or len(measured) == 2
 
 
 def propose_config(inspection: Inspection) -> str:
@@ -203,7 +209,7 @@ def propose_config(inspection: Inspection) -> str:
         "version: 1",
         *_axis_lines(inspection, torque),
         "signals:",
-        *_time_lines(inspection),
+        *_time_lines(inspection, list(roles.values()) or list(inspection.channels)),
         *_torque_lines(torque, roles),
         *_position_lines("motor_position", roles.get("motor_position")),
     ]
@@ -232,21 +238,21 @@ def _axis_lines(inspection: Inspection, torque: str | None) -> list[str]:
     return lines
 
 
-def _time_lines(inspection: Inspection) -> list[str]:
+def _time_lines(inspection: Inspection, channels: Sequence[ChannelSummary]) -> list[str]:
     if inspection.time_column is not None:
         return [
             "  time:",
             f"    source: {_quoted(inspection.time_column)}",
             f"    unit: {inspection.time_unit}  # s, ms, us or ns",
         ]
-    running = [set(channel.clocks) for channel in inspection.channels if channel.clocks]
-    if not running:
+    running = [set(channel.clocks) for channel in channels]
+    if not any(running):
         return ["  time:", f"    rate_hz: {PLACEHOLDER}  # no column looks like time: sampling rate in Hz"]
     common = set.intersection(*running)
     offered = [clock for clock in ("header_stamp", "log_time", "publish_time") if clock in common]
     if not offered:
         return []
-    return ["  time:", f"    source: {offered[0]}  # running in every channel: {', '.join(offered)}"]
+    return ["  time:", f"    source: {offered[0]}  # running in all of these: {', '.join(offered)}"]
 
 
 def _torque_lines(role: str | None, roles: dict[str, ChannelSummary]) -> list[str]:

@@ -1,9 +1,9 @@
 """Values between the samples: interpolation without aliasing and without delay. Arrays in, arrays out.
 
-Samples whose stamps are those wanted are handed on as they are. Everything else goes through a spline; uniform
-samples are first brought to a finer grid by a linear-phase FIR filter, for a quintic spline alone is exact
-to 1e-4 only below a third of the Nyquist frequency (error 2 (w / (2 pi - w))^6 at w radians a sample; Unser,
-"Splines: a perfect fit for signal and image processing", IEEE Signal Processing Magazine 16(6), 1999).
+Samples whose stamps are those wanted are handed on as they are. Everything else goes through a spline;
+uniform samples are first brought to a finer grid by a linear-phase FIR filter, for a quintic spline alone is
+exact to 1e-4 only below a third of the Nyquist frequency (error 2 (w / (2 pi - w))^6 at w radians a sample;
+Unser, "Splines: a perfect fit for signal and image processing", IEEE Signal Processing Magazine 16(6), 1999).
 """
 
 from __future__ import annotations

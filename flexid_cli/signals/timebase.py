@@ -1,8 +1,8 @@
 """Time of a log: which clock, what its stamps are worth, where it stops. Arrays in, arrays out.
 
-Stamps are int64 nanoseconds. A clock is cleaned in this order: stamps that are not set are dropped, jumps back
-of the clock split the record into stretches, stamps out of order are sorted, equal stamps are dropped, and
-stamps that were only rounded (0.0029, 0.0057, 0.0086 s) are put back on the uniform clock they come from.
+Stamps are int64 nanoseconds. A clock is cleaned in this order: stamps that are not set are dropped, jumps
+back of the clock split the record into stretches, stamps out of order are sorted, equal stamps are dropped,
+and stamps that were only rounded (0.0029, 0.0057, 0.0086 s) are put back on the uniform clock they come from.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ def to_nanoseconds(values: Array, seconds_per_unit: float) -> tuple[IntArray, Bo
 
 def fixed_rate_stamps(samples: int, rate_hz: float) -> IntArray:
     """Stamps of a record without a time column, shape (samples,), in ns."""
-    return np.rint(np.arange(samples) * (NS / rate_hz)).astype(np.int64)
+    stamps: IntArray = np.rint(np.arange(samples) * (NS / rate_hz)).astype(np.int64)
+    return stamps
 
 
 def is_usable(stamps: IntArray) -> bool:
@@ -262,7 +263,8 @@ def _first_reset(stamps: IntArray, period: float, limit: float) -> int | None:
         returns = stop < stamps.size
         if returns and stop - first < RESET_RUN:
             continue
-        if _lies_over(stamps[:first], stamps[first:stop], period, limit):
+        reach = int(np.searchsorted(high[:first], stamps[first:stop].min() - 2.0 * max(period, limit)))
+        if _lies_over(stamps[reach:first], stamps[first:stop], period, limit):
             return int(first)
     return None
 

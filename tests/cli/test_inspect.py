@@ -66,7 +66,6 @@ def test_numbers_are_whole_where_names_are_long(tmp_path):
     table = run(path).stdout.split("\n\n")[0]
     assert "1.22221e+202" in table
     assert "-1.22221e-198" in table
-    assert re.sub(r"\s", "", "".join(line[:17] for line in table.splitlines() if line.startswith(("a_", "_")))) or True
     assert "…" not in table
 
 
@@ -150,19 +149,30 @@ def inspection(*channels: ChannelSummary, time_column: str | None = None) -> Ins
             ["motor_torque", "motor_position", "joint_position", "reference_position"],
         ),
         (["iq", "theta"], ["motor_current", "motor_position"]),
-        (["Iq_ref", "Iq_meas", "MotorAngle", "LinkAngle", "MotorSpeed"], [None, "motor_current", "motor_position", "joint_position", None]),
-        (["drive_voltage", "motor_position", "reference_position"], ["motor_torque", "motor_position", "reference_position"]),
+        (
+            ["Iq_ref", "Iq_meas", "MotorAngle", "LinkAngle", "MotorSpeed"],
+            [None, "motor_current", "motor_position", "joint_position", None],
+        ),
+        (
+            ["drive_voltage", "motor_position", "reference_position"],
+            ["motor_torque", "motor_position", "reference_position"],
+        ),
         (["link_torque", "qm", "ql", "dqm"], ["joint_torque", "motor_position", "joint_position", None]),
         (
-            ["/js/a1/position", "/js/a1/velocity", "/js/a1/effort", "/js/a2/position", "/js/a2/effort", "/js/a3/position"],
-            ["motor_position", None, "motor_torque", None, None, None],
+            ["/js/a1/position", "/js/a1/velocity", "/js/a1/effort", "/js/a2/position", "/js/a3/position"],
+            ["motor_position", None, "motor_torque", None, None],
         ),
-        (["/motor/current.data", "/motor/position.data", "/link/position.data"], ["motor_current", "motor_position", "joint_position"]),
+        (
+            ["/motor/current.data", "/motor/position.data", "/link/position.data"],
+            ["motor_current", "motor_position", "joint_position"],
+        ),
         (["temperature", "error"], [None, None]),
     ],
-)  # fmt: skip
+)
 def test_roles_are_guessed_from_names(names, roles):
-    found = {channel.info.source: role for role, channel in guess_roles(inspection(*map(summary, names))).items()}
+    found = {
+        channel.info.source: role for role, channel in guess_roles(inspection(*map(summary, names))).items()
+    }
     assert [found.get(name) for name in names] == roles
 
 
@@ -170,19 +180,23 @@ def test_roles_are_guessed_from_names(names, roles):
     "channels",
     [
         inspection(summary("motor_current"), summary("motor_position"), time_column="time"),
-        inspection(summary("u [V]", unit="V"), summary("drive_voltage"), summary("x: \"q\"", unit="count")),
+        inspection(summary("u [V]", unit="V"), summary("drive_voltage"), summary('x: "q"', unit="count")),
         inspection(
             summary("/js/a1/position", "sensor_msgs/msg/JointState", clocks=("header_stamp", "log_time")),
             summary("/js/a1/effort", "sensor_msgs/msg/JointState", clocks=("log_time",)),
         ),
-        inspection(summary("2"), summary("pos deg", unit="deg"), summary("tau", unit="furlong"), time_column="1"),
+        inspection(
+            summary("2"), summary("pos deg", unit="deg"), summary("tau", unit="furlong"), time_column="1"
+        ),
         inspection(summary("temperature")),
     ],
 )
 def test_every_proposal_loads_once_it_is_filled_in(channels):
     text = propose_config(channels)
     text = re.sub(rf"source: {PLACEHOLDER}.*\n(\s+unit: ){PLACEHOLDER}  # A", r"source: left\n\1A  # A", text)
-    text = re.sub(rf"source: {PLACEHOLDER}.*\n(\s+unit: ){PLACEHOLDER}  # rad", r"source: right\n\1rad  # rad", text)
+    text = re.sub(
+        rf"source: {PLACEHOLDER}.*\n(\s+unit: ){PLACEHOLDER}  # rad", r"source: right\n\1rad  # rad", text
+    )
     text = text.replace(f"unit: {PLACEHOLDER}  # the log says", "unit: N.m  # the log says")
     text = filled(text)
     if "axis.torque_constant" not in text and "motor_current:" in text and "torque_constant_nm" not in text:
@@ -192,19 +206,28 @@ def test_every_proposal_loads_once_it_is_filled_in(channels):
 
 def test_clock_of_every_channel_is_proposed():
     channels = inspection(
-        summary("/m/position", clocks=("header_stamp", "log_time")), summary("/m/current", clocks=("log_time",))
+        summary("/m/position", clocks=("header_stamp", "log_time")),
+        summary("/m/current", clocks=("log_time",)),
     )
     assert "source: log_time" in propose_config(channels)
 
 
 class TestRealRecordings:
-    @pytest.mark.parametrize("name", ["odrive_slow_b", "emps_pulses", "kuka_kr300_a_axis3", "quanser_2dsfl_stage1"])
+    @pytest.mark.parametrize(
+        "name", ["odrive_slow_b", "emps_pulses", "kuka_kr300_a_axis3", "quanser_2dsfl_stage1"]
+    )
     def test_roles_and_rates(self, recordings, name):
         found = inspect_log([recordings / "real" / f"{name}.csv.gz"])
         facts = json.loads((recordings / "real" / f"{name}.facts.json").read_text(encoding="utf-8"))
         roles = {role: channel.info.source for role, channel in guess_roles(found).items()}
         assert found.time_column == "time"
-        for role in ("motor_position", "joint_position", "reference_position", "motor_current", "motor_torque"):
+        for role in (
+            "motor_position",
+            "joint_position",
+            "reference_position",
+            "motor_current",
+            "motor_torque",
+        ):
             if role in facts["units"]:
                 assert roles[role] == role
         if "sample_rate_hz" in facts:

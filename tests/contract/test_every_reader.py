@@ -336,7 +336,7 @@ def test_channels_agree_with_read(name: str, maker: Maker, tmp_path: Path) -> No
         assert log.channels[source].values.size == info.count, source
     for source in SOURCES:
         assert infos[source].count == ROWS
-        for alias in infos[source].aliases:
+        for alias in infos[source].aliases[:1]:
             try:
                 again = read_log([path], [alias]).channels[alias]
             except InputError as error:

@@ -26,7 +26,11 @@ GEAR = 40.0
 
 
 def config_of(
-    torque: str = "unit: A", motor: str = "unit: rad", joint: str = "unit: rad", time: str = "unit: s", gap: str = ""
+    torque: str = "unit: A",
+    motor: str = "unit: rad",
+    joint: str = "unit: rad",
+    time: str = "unit: s",
+    gap: str = "",
 ):
     return parse_config(
         f"""
@@ -55,9 +59,7 @@ def columns_of(seed: int, samples: int = SAMPLES) -> dict[str, np.ndarray]:
 
 def build(columns: dict[str, np.ndarray], config=None) -> Recording:
     channels = {name: RawChannel(name, np.asarray(values, dtype=float)) for name, values in columns.items()}
-    return recording_from_raw(
-        RawLog("csv", (Path("a.csv"),), channels), config or config_of(), channels["t"]
-    )
+    return recording_from_raw(RawLog("csv", (Path("a.csv"),), channels), config or config_of(), channels["t"])
 
 
 def assert_same(one: Recording, other: Recording, tolerance: float = 1e-12) -> None:
@@ -178,7 +180,7 @@ def test_a_reset_keeps_every_sample(seed, at, back):
 @quick
 @given(seeds, st.integers(20, 60), st.floats(0.0, 0.95))
 def test_different_rates_and_phases_align(seed, hundreds, phase):
-    """Torque and motor at 2 to 6 kHz against a joint encoder at 500 Hz, content up to 0.1 of its Nyquist rate."""
+    """Torque and motor at 2 to 6 kHz against a joint encoder at 500 Hz, content up to a tenth of that."""
     rate = 100.0 * hundreds
     rng = np.random.default_rng(seed)
     tones = [(rng.normal(), f, rng.uniform(0, 6)) for f in (0.7, *rng.uniform(1, 25, 3))]

@@ -7,7 +7,7 @@ import pytest
 
 from flexid_cli.config.load import parse_config
 from flexid_cli.errors import InputError
-from flexid_cli.signals.convert import convert_position, convert_torque, find_wraps
+from flexid_cli.signals.convert import convert_position, convert_torque, count_wraps
 
 RAW = np.array([0.5, -1.25, 2.0])
 
@@ -15,7 +15,8 @@ RAW = np.array([0.5, -1.25, 2.0])
 def config_of(axis: str = "gear_ratio: 50", torque: str = "", motor: str = "unit: rad, side: joint"):
     torque = torque or "motor_torque: {source: i, unit: N.m}"
     return parse_config(
-        f"version: 1\naxis: {{name: a, {axis}}}\nsignals:\n  {torque}\n  motor_position: {{source: q, {motor}}}\n"
+        f"version: 1\naxis: {{name: a, {axis}}}\n"
+        f"signals:\n  {torque}\n  motor_position: {{source: q, {motor}}}\n"
     )
 
 
@@ -40,14 +41,24 @@ def position_of(axis: str, motor: str, raw=RAW):
         ("gear_ratio: 50", "motor_torque: {source: i, unit: V, torque_per_volt: 3}", 150.0, "N.m"),
         ("gear_ratio: 50", "joint_torque: {source: i, unit: mV, torque_per_volt: 3}", 3e-3, "N.m"),
         ("gear_ratio: 50, torque_constant_nm_per_a: 0.3", "motor_current: {source: i, unit: A}", 15.0, "N.m"),
-        ("gear_ratio: 50, torque_constant_nm_per_a: 0.3", "motor_current: {source: i, unit: mA}", 15e-3, "N.m"),
+        (
+            "gear_ratio: 50, torque_constant_nm_per_a: 0.3",
+            "motor_current: {source: i, unit: mA}",
+            15e-3,
+            "N.m",
+        ),
         (
             "gear_ratio: 50, torque_constant_nm_per_a: 8.925, torque_constant_side: joint",
             "motor_current: {source: i, unit: A}",
             8.925,
             "N.m",
         ),
-        ("gear_ratio: 50, torque_constant_nm_per_a: unknown", "motor_current: {source: i, unit: mA}", 1e-3, "A"),
+        (
+            "gear_ratio: 50, torque_constant_nm_per_a: unknown",
+            "motor_current: {source: i, unit: mA}",
+            1e-3,
+            "A",
+        ),
         ("gear_ratio: 1", "motor_torque: {source: i, unit: N.m, scale: 2, sign: -1}", -2.0, "N.m"),
     ],
 )
@@ -58,7 +69,9 @@ def test_torque(axis, torque, factor, unit):
 
 
 def test_force_of_a_linear_axis():
-    result = torque_of("gear_ratio: 1", "motor_torque: {source: i, unit: V, torque_per_volt: 35.15}", "unit: m")
+    result = torque_of(
+        "gear_ratio: 1", "motor_torque: {source: i, unit: V, torque_per_volt: 35.15}", "unit: m"
+    )
     assert result.values == pytest.approx(RAW * 35.15)
     assert result.unit == "N"
 
@@ -97,7 +110,12 @@ TIME = np.linspace(0.0, 10.0, 5001)
 
 @pytest.mark.parametrize(
     ("motor", "turn"),
-    [("unit: rad", 2 * np.pi), ("unit: deg", 360.0), ("unit: rev", 1.0), ("unit: count, counts_per_rev: 4096", 4096)],
+    [
+        ("unit: rad", 2 * np.pi),
+        ("unit: deg", 360.0),
+        ("unit: rev", 1.0),
+        ("unit: count, counts_per_rev: 4096", 4096),
+    ],
 )
 @pytest.mark.parametrize("low", [0.0, -0.5])
 def test_wrapping_encoder_is_unwrapped(motor, turn, low):
@@ -119,24 +137,34 @@ def test_fast_axis_is_not_unwrapped():
 def test_a_single_outlier_is_no_wrap():
     turns = np.sin(TIME)
     turns[1000] += 0.7
-    assert find_wraps(turns, 1.0).size == 0
+    assert not count_wraps(turns, 1.0).any()
 
 
 def test_unwrap_can_be_forced_and_forbidden():
     steps = np.array([0.0, 0.9, 0.1, 0.3])
-    assert position_of("gear_ratio: 1", "unit: rev, unwrap: true", steps).values[1] == pytest.approx(-0.2 * np.pi)
+    assert position_of("gear_ratio: 1", "unit: rev, unwrap: true", steps).values[1] == pytest.approx(
+        -0.2 * np.pi
+    )
     wrapped = (3.0 * TIME) % 1.0
     untouched = position_of("gear_ratio: 1", "unit: rev, unwrap: false", wrapped)
     assert np.array_equal(untouched.values, wrapped * (2 * np.pi))
 
 
-def test_gap_between_wraps_is_judged_by_size_alone():
-    true = 3.0 * TIME
+@pytest.mark.parametrize("missing", [3, 40, 150])
+def test_a_step_over_missing_samples_is_judged_by_the_velocity(missing):
+    true = 3.0 * TIME  # 150 samples take 0.9 turns
     keep = np.ones(TIME.size, dtype=bool)
-    keep[2000:2150] = False
-    wrapped = (true % 1.0)[keep]
-    jumps = find_wraps(wrapped, 1.0, starts=np.array([0, 2000]))
-    assert jumps.size >= 27
+    keep[2000 : 2000 + missing] = False
+    wrapped, periods = (true % 1.0)[keep], np.diff(np.flatnonzero(keep))
+    turns = np.concatenate(([0], np.cumsum(count_wraps(wrapped, 1.0, periods=periods))))
+    assert np.ptp(wrapped - turns - true[keep]) < 1e-9
+
+
+def test_a_fast_step_over_missing_samples_is_no_evidence():
+    turns = np.delete(np.sin(5 * TIME) * 3.0, slice(1000, 1100))
+    periods = np.diff(np.delete(np.arange(TIME.size), slice(1000, 1100)))
+    assert np.abs(np.diff(turns)).max() > 0.5
+    assert not count_wraps(turns, 1.0, periods=periods).any()
 
 
 def test_linear_axis_has_no_turn():

@@ -47,7 +47,9 @@ def test_half_a_sample_later_is_exact_up_to_the_pass_band(share):
     assert error.max() < 0.5  # the last samples know only one side
 
 
-@pytest.mark.parametrize(("fast", "slow"), [(1000, 800), (1000, 500), (1000, 350.87), (8000, 500), (20000, 100)])
+@pytest.mark.parametrize(
+    ("fast", "slow"), [(1000, 800), (1000, 500), (1000, 350.87), (8000, 500), (20000, 100)]
+)
 def test_faster_signal_is_flat_in_band_and_free_of_aliases(fast, slow):
     stamps, grid = uniform(fast, 4), uniform(slow, 4, 1_300_000)[:-2].astype(float)
     nyquist = slow / 2

@@ -131,7 +131,9 @@ class TestResets:
         fast = np.concatenate([regular(1000), regular(1000)])
         slow = np.concatenate([regular(500, 2 * MS, 300_000), regular(500, 2 * MS, 300_000)])
         lines = build_timelines([("fast", fast, None), ("slow", slow, None)])
-        shifts = [int(line.stamps[half] - line.stamps[0]) for line, half in zip(lines, (1000, 500), strict=True)]
+        shifts = [
+            int(line.stamps[half] - line.stamps[0]) for line, half in zip(lines, (1000, 500), strict=True)
+        ]
         assert shifts[0] == shifts[1]
         assert all(np.all(np.diff(line.stamps) > 0) for line in lines)
         assert lines[0].stamps[1000] - lines[0].stamps[999] > 1e9 / 2
@@ -236,7 +238,9 @@ class TestRounding:
 
     def test_true_jitter_in_coarse_stamps_is_kept(self):
         rng = np.random.default_rng(5)
-        stamps = np.rint((np.arange(2000) * 2.85e6 + rng.normal(0, 6e5, 2000)) / 2e5).astype(np.int64) * 200_000
+        stamps = (
+            np.rint((np.arange(2000) * 2.85e6 + rng.normal(0, 6e5, 2000)) / 2e5).astype(np.int64) * 200_000
+        )
         stamps = np.unique(stamps)
         assert clean(stamps).quantum_ns == 0
         assert np.array_equal(clean(stamps).stamps, stamps)

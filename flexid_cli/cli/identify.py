@@ -1,0 +1,158 @@
+"""``flexid identify``: the main job."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from flexid_cli.cli.files import STDOUT, check_outputs
+from flexid_cli.cli.options import (
+    Console,
+    config_option,
+    example,
+    force_option,
+    json_option,
+    output_option,
+    pass_console,
+    set_option,
+    verbosity_options,
+    wants_color,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Any
+
+    from flexid_cli.config.schema import Config
+    from flexid_cli.estimate.result import Identification
+    from flexid_cli.readers.base import RawLog
+    from flexid_cli.report.document import InputFile
+
+NOTHING_IDENTIFIED = 3
+
+
+@click.command(
+    short_help="Estimate stiffness, inertias and friction from a log.",
+    epilog=example(
+        "flexid identify sample_logs/axis3.mcap --config configs/axis3.yaml",
+        "flexid identify sample_logs/axis3.bag -c configs/axis3.yaml -o report.md -o report.json",
+    ),
+)
+@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="LOG...")
+@config_option
+@click.option(
+    "--route",
+    type=click.Choice(["direct", "paper"]),
+    help="direct: fit the physical parameters, all terms kept (default); paper: reproduce the tables of Pham,"
+    " Gautier and Poignet, two sigma and Table 3's inversion included.",
+)
+@set_option
+@json_option
+@output_option
+@force_option
+@verbosity_options
+@pass_console
+def identify(
+    console: Console,
+    logs: tuple[Path, ...],
+    config: Path,
+    route: str | None,
+    overrides: tuple[str, ...],
+    as_json: bool,
+    outputs: tuple[Path, ...],
+    force: bool,
+) -> None:
+    """Estimate stiffness, inertias, friction and gravity of one axis from LOG, with confidence intervals.
+
+    LOG is a CSV (also .gz, .zst), an MCAP, a rosbag2 folder or .db3, or a ROS 1 .bag; several LOGs are the files
+    of one run. The report goes to the terminal, and with -o to .json and .md files (figures as SVG beside the
+    Markdown). Exit code 3: the data do not determine any parameter.
+    """
+    from flexid_cli.config.load import load_config
+    from flexid_cli.report.write import check_formats
+
+    check_formats([path for path in outputs if path != STDOUT])
+    check_outputs(outputs, force=force, inputs=[*logs, config])
+    if route is not None:
+        overrides = (*overrides, f"estimate.route={route}")
+    loaded = load_config(config, overrides)
+    identification, document = run_identify(logs, loaded, console)
+    _write(document, identification, outputs, force=force)
+    if as_json:
+        from flexid_cli.report.json import render_json
+
+        click.echo(render_json(document), nl=False)
+    else:
+        _show(document, console)
+    if not _anything_identified(identification):
+        console.error(
+            "no parameter could be identified from this recording",
+            "the reasons stand in the report; `flexid inspect LOG` shows what was recorded",
+        )
+        raise SystemExit(NOTHING_IDENTIFIED)
+
+
+def run_identify(
+    logs: Sequence[Path], config: Config, console: Console
+) -> tuple[Identification, dict[str, Any]]:
+    """Read, identify, and build the report document."""
+    from flexid_cli.config.load import config_digest
+    from flexid_cli.estimate.identify import identify as estimate
+    from flexid_cli.report.document import build_document
+    from flexid_cli.signals.build import build_recording
+
+    recording, raw = build_recording(logs, config)
+    console.detail(f"read {recording.samples} samples at {recording.sample_rate_hz:.6g} Hz from {raw.format}")
+    identification = estimate(recording, config)
+    document = build_document(
+        identification=identification,
+        recording=recording,
+        inputs=_inputs(logs, raw),
+        config_digest=config_digest(config),
+        config_resolved=config.resolved(),
+    )
+    return identification, document
+
+
+def _inputs(logs: Sequence[Path], raw: RawLog) -> list[InputFile]:
+    from flexid_cli.report.document import InputFile
+    from flexid_cli.readers.digest import digest
+
+    notes = tuple(note.message for note in raw.notes)
+    return [
+        InputFile(path=str(log), sha256=digest(log), format=raw.format, notes=notes if k == 0 else ())
+        for k, log in enumerate(logs)
+    ]
+
+
+def _write(
+    document: dict[str, Any], identification: Identification, outputs: Sequence[Path], *, force: bool
+) -> None:
+    from flexid_cli.report.json import render_json
+    from flexid_cli.report.write import render_outputs
+    from flexid_cli.writers.files import write_files
+
+    files = [path for path in outputs if path != STDOUT]
+    if files:
+        write_files(render_outputs(document, identification, files), force=force)
+    if len(files) < len(outputs):
+        click.echo(render_json(document), nl=False)
+
+
+def _show(document: dict[str, Any], console: Console) -> None:
+    import sys
+
+    from rich.console import Console as Terminal
+
+    from flexid_cli.report.console import print_report
+
+    if console.verbosity < -1:
+        return
+    terminal = Terminal(file=sys.stdout, no_color=wants_color() is False, highlight=False)
+    print_report(document, terminal)
+
+
+def _anything_identified(identification: Identification) -> bool:
+    return any(e.verdict == "identified" for model in identification.models for e in model.parameters)
