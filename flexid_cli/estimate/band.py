@@ -28,6 +28,8 @@ BAND_OVER_F1 = {"two_encoders": 2.0, "motor_only": 1.4}
 RIGID_BAND_OVER_F1 = 0.3
 # Signals are used up to the frequency at which their power still is ten times their noise floor.
 SIGNAL_TO_NOISE = 10.0
+# A rigid axis has no resonance to tune to: its band holds nearly all of the torque's power and no more.
+TORQUE_POWER = 0.999
 # The velocity whose sign is taken keeps this many times the columns' band.
 SIGN_BAND = 8.0
 SCAN_STEP = 1.25
@@ -109,7 +111,7 @@ def _band(recording: Recording, config: Config, model_id: str, f1: float | None)
         return config.pipeline.band_hz
     usable = usable_band(recording, joint=model_id == "two_encoders")
     if model_id == "rigid":
-        wanted = RIGID_BAND_OVER_F1 * f1 if f1 else usable
+        wanted = RIGID_BAND_OVER_F1 * f1 if f1 else min(usable, torque_band(recording))
     elif f1:
         wanted = BAND_OVER_F1[model_id] * f1
     elif model_id == "two_encoders" or config.pipeline.decimation is not None:
@@ -158,6 +160,18 @@ def usable_band(recording: Recording, *, joint: bool) -> float:
         above = frequency[1:][shaped[1:] > SIGNAL_TO_NOISE * floor]
         edges.append(float(above[-1]) if above.size else rate * MAX_BAND_OVER_RATE)
     return min(*edges, MAX_BAND_OVER_RATE * rate) if len(edges) > 1 else min(edges[0], MAX_BAND_OVER_RATE * rate)
+
+
+def torque_band(recording: Recording) -> float:
+    """Frequency below which 99.9 % of the torque's power about its mean lies, Hz."""
+    from scipy.signal import welch
+
+    segment = max(recording.segments, key=lambda s: s.samples)
+    rate = recording.sample_rate_hz
+    length = int(min(segment.samples, max(256, 8 * rate)))
+    frequency, density = welch(segment.torque - segment.torque.mean(), fs=rate, nperseg=length)
+    share = np.cumsum(density) / np.sum(density)
+    return float(frequency[min(int(np.searchsorted(share, TORQUE_POWER)), frequency.size - 1)])
 
 
 def find_resonance(recording: Recording, gravity_m_per_s2: float) -> float | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flexid_cli.errors import DataError
 from flexid_cli.estimate.covariance import robust_covariance
 from flexid_cli.estimate.least_squares import numerical_rank
-from flexid_cli.models.base import Model
+from flexid_cli.models.base import Block, Model
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,12 @@ class FitResult:
 
 def block_matrices(model: Model, column: Callable[[str, int], Array]) -> tuple[Array, ...]:
     """Columns of each block of a model, shapes (rows, columns of the block)."""
-    return tuple(np.column_stack([column(*c) for c in block.columns]) for block in model.blocks)
+    return tuple(block_matrix(block, column) for block in model.blocks)
+
+
+def block_matrix(block: Block, column: Callable[[str, int], Array]) -> Array:
+    """Columns of one block, shape (rows, columns)."""
+    return np.column_stack([column(*c) for c in block.columns])
 
 
 def fit(

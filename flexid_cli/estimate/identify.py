@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from flexid_cli.errors import DataError
 from flexid_cli.estimate import band, budget, paper_route, summary
-from flexid_cli.estimate.fit import block_matrices, fit
+from flexid_cli.estimate.fit import block_matrices, block_matrix, fit
 from flexid_cli.estimate.least_squares import solve
 from flexid_cli.estimate.result import Identification, ModelResult, Skipped
 from flexid_cli.estimate.reversal import fit_reversal_velocity
@@ -19,7 +18,7 @@ from flexid_cli.estimate.solution import Solution
 from flexid_cli.models import motor_only
 from flexid_cli.models.motor_only import MotorOnly
 from flexid_cli.models.rigid import Rigid
-from flexid_cli.models.two_encoders import TwoEncoders, TwoEncodersStructured
+from flexid_cli.models.two_encoders import TOTAL, TwoEncoders, TwoEncodersStructured
 from flexid_cli.pipeline.chain import Chain
 from flexid_cli.pipeline.columns import Columns
 
@@ -123,45 +122,43 @@ def _two_encoders(recording: Recording, config: Config, f1: float | None) -> Sol
     columns = make_columns(recording, config, tuning)
     linear = TwoEncoders()
 
-    # The sum of both equations holds neither torsion nor a trivial solution: its residual judges the width.
-    total = TwoEncodersStructured.blocks[0]
 
     def cost() -> float:
-        return _log_residual(columns, total.columns)
+        return _log_residual(columns, TOTAL.columns)
 
     columns.set_reversal_velocity(fit_reversal_velocity(columns, cost))
-    candidates = {}
-    start = np.ones(len(linear.parameters))
-    for method, model, weighted in (
-        ("ols", linear, False),
-        ("wls", linear, True),
-        ("structured", TwoEncodersStructured(), True),
-    ):
-        matrices = block_matrices(model, columns)
-        result = fit(
-            model, matrices, start, columns.lengths, weighted=weighted, covariance=config.estimate.covariance
-        )
-        start = result.theta
-        candidates[method] = Solution(model, columns, matrices, result, tuning, method, "")
-    if config.estimate.method != "auto":
-        return replace(candidates[config.estimate.method], method_reason="configured")
-    return _surest(candidates)
+    method = config.estimate.method
+    model: TwoEncoders | TwoEncodersStructured = TwoEncoders()
+    if method in {"auto", "structured"}:
+        model = TwoEncodersStructured()
+    matrices = block_matrices(model, columns)
+    result = fit(
+        model,
+        matrices,
+        _two_encoders_start(columns),
+        columns.lengths,
+        weighted=method != "ols",
+        covariance=config.estimate.covariance,
+    )
+    if method == "auto":
+        reason = "motor and torsion equation, weighted: what the load equation lacks cannot draw K to zero"
+        return Solution(model, columns, matrices, result, tuning, "structured", reason)
+    return Solution(model, columns, matrices, result, tuning, method, "configured")
 
 
-def _surest(candidates: dict[str, Solution]) -> Solution:
-    """The estimator with the smallest total uncertainty of Jm, K and JL, noise bias included."""
-    levels = None
-    totals = {}
-    for method, solution in candidates.items():
-        levels = levels or budget.noise_levels(solution.columns.recording)
-        bias = budget.noise_bias(solution.model, solution.result, solution.columns, levels)
-        total = np.hypot(solution.result.stderr, bias)[[0, 3, 4]]
-        converged = solution.result.converged
-        totals[method] = float(np.sum((total / solution.result.theta[[0, 3, 4]]) ** 2)) if converged else np.inf
-    best = min(totals, key=lambda m: totals[m])
-    listed = ", ".join(f"{m} {100 * np.sqrt(v / 3):.2g} %" for m, v in totals.items())
-    reason = f"smallest relative uncertainty of Jm, K, JL with noise bias ({listed})"
-    return replace(candidates[best], method_reason=reason)
+def _two_encoders_start(columns: Columns) -> Array:
+    """Motor equation and torsion equation, each by linear least squares of its own."""
+    motor, torsion = (block_matrix(block, columns) for block in TwoEncodersStructured.blocks)
+    Jm, FVm, FSm, K, minus_c = _regress(motor)
+    _, JL, MX, MY, FV, FS = _regress(torsion) * K
+    return np.array([Jm, FVm, FSm, K, JL, MX, MY, FV, FS, -minus_c])
+
+
+def _regress(M: Array) -> Array:
+    """First column on the others; the shortest solution in scaled units where columns are dependent."""
+    scale = np.linalg.norm(M[:, 1:], axis=0)
+    scale[scale == 0.0] = 1.0
+    return np.asarray(np.linalg.lstsq(M[:, 1:] / scale, M[:, 0], rcond=None)[0] / scale, dtype=np.float64)
 
 
 def _motor_only(recording: Recording, config: Config, f1: float | None) -> Solution:

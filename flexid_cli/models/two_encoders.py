@@ -3,15 +3,16 @@
 Motor:  0 = Gm - Jm qm'' - FVm qm' - FSm S - K (d - z)
 Load:   0 = JL q'' + FV q' + FS SL + MX g cos q + MY g sin q - K (d - z),   d = qm - q
 
-The parameter ``c = K z`` keeps the equations linear. The same parameters also satisfy the equations' sum, which
-holds no torsion, and the load equation divided by K:
+The parameter ``c = K z`` keeps the equations linear. Least squares on the pair as it stands is drawn towards the
+trivial solution of the load equation (K, JL, ... all zero) by whatever that equation lacks: encoder noise, a load
+torque from elsewhere. Divided by K it is an equation for the torsion, in which no such solution exists:
 
-Total:   0 = Gm - Jm qm'' - FVm qm' - FSm S - (JL q'' + FV q' + FS SL + MX g cos q + MY g sin q)
 Torsion: 0 = d - (c + JL q'' + FV q' + FS SL + MX g cos q + MY g sin q) / K
 
-In the second form torque noise enters one equation and torsion noise the other, each with coefficient one, so
-that least squares weighted by the residuals' sizes is not drawn towards the trivial solution of the homogeneous
-load equation (K, JL, ... all zero).
+Then K rests on the motor equation, and the load's parameters on the torsion that they cause. The sum of motor and
+load equation, which holds no torsion, judges choices that must not depend on K:
+
+Total:   0 = Gm - Jm qm'' - FVm qm' - FSm S - (JL q'' + FV q' + FS SL + MX g cos q + MY g sin q)
 """
 
 from __future__ import annotations
@@ -72,32 +73,33 @@ class TwoEncoders:
         return motor, load
 
 
+TOTAL = Block("total", (*_MOTOR, *_LOAD))
+
+
 class TwoEncodersStructured:
-    """Eq. (13) as total and torsion equation: the same parameters, noise with coefficient one."""
+    """Eq. (13) as motor and torsion equation: the same parameters, no trivial solution."""
 
     id = "two_encoders"
     equation = EQUATION
     parameters = PARAMETERS
     blocks = (
-        Block("total", (*_MOTOR, *_LOAD)),
+        TwoEncoders.blocks[0],
         Block("torsion", (("torsion", 0), ("one", 0), *_LOAD)),
     )
 
     def coefficients(self, theta: Array) -> tuple[Array, Array]:
-        """Coefficients of total and torsion equation."""
+        """Coefficients of motor and torsion equation."""
+        motor, _ = TwoEncoders().coefficients(theta)
         load = theta[list(_LOAD_PARAMETERS)]
-        total = np.concatenate([[1.0], -theta[:3], -load])
-        torsion = np.concatenate([[1.0, -theta[9] / theta[3]], -load / theta[3]])
-        return total, torsion
+        return motor, np.concatenate([[1.0, -theta[9] / theta[3]], -load / theta[3]])
 
     def jacobian(self, theta: Array) -> tuple[Array, Array]:
         """Derivatives of the coefficients."""
         K = theta[3]
-        total, torsion = np.zeros((9, theta.size)), np.zeros((7, theta.size))
-        total[[1, 2, 3], [0, 1, 2]] = -1.0
-        total[[4, 5, 6, 7, 8], _LOAD_PARAMETERS] = -1.0
+        motor, _ = TwoEncoders().jacobian(theta)
+        torsion = np.zeros((7, theta.size))
         torsion[[2, 3, 4, 5, 6], _LOAD_PARAMETERS] = -1.0 / K
         torsion[1, 9] = -1.0 / K
         torsion[1, 3] = theta[9] / K**2
         torsion[2:, 3] = theta[list(_LOAD_PARAMETERS)] / K**2
-        return total, torsion
+        return motor, torsion

@@ -80,9 +80,10 @@ def magnitude(sos: Array, frequency_hz: Array, sample_rate_hz: float) -> Array:
 
 def _settling_samples(sos: Array, remaining: float = 1e-3) -> int:
     """Samples until the slowest pole has decayed to ``remaining``."""
-    from scipy.signal import sos2zpk
-
-    radius = float(np.max(np.abs(sos2zpk(sos)[1]), initial=0.0))
+    a1, a2 = sos[:, 4], sos[:, 5]
+    spread = a1**2 - 4.0 * a2
+    real = 0.5 * (np.abs(a1) + np.sqrt(np.maximum(spread, 0.0)))
+    radius = float(np.max(np.where(spread < 0.0, np.sqrt(np.abs(a2)), real)))
     if radius < 1e-6:
         return 1
     return int(np.ceil(np.log(remaining) / np.log(min(radius, 1.0 - 1e-9)))) + 1

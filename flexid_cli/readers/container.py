@@ -116,6 +116,7 @@ class _Run:
         self.files = sorted(filled, key=lambda pair: pair[1].first_log_time or 0)
         self.log = str(self.files[0][0].path)
         self._decoders: dict[TopicType, Decoder | InputError] = {}
+        self._failures: dict[str, InputError] = {}
         self._leaves: dict[str, dict[str, Leaf]] = {}
         self._seen: dict[str, dict[str, int]] = {}
         self._samples: dict[str, int] = {}
@@ -156,7 +157,7 @@ class _Run:
                     found.setdefault(name, leaf)
                     seen[name] = seen.get(name, 0) + 1
         except InputError as error:
-            self._decoders.setdefault(kind, error)
+            self._failures.setdefault(kind.topic, error)
 
     def listing(self) -> list[ChannelInfo]:
         """List all channels met."""
@@ -191,9 +192,9 @@ class _Run:
         return resolve(source, leaves, self.topics, log=self.log)
 
     def _refuse_undecodable(self, source: str) -> None:
-        for kind, decoder in self._decoders.items():
-            if isinstance(decoder, InputError) and may_name(source, kind.topic):
-                raise decoder
+        for topic, error in self._failures.items():
+            if may_name(source, topic):
+                raise error
 
     def _look_at_all(self, source: str) -> None:
         for file, _ in self.files:

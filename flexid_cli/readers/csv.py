@@ -427,13 +427,12 @@ def _first_lines(head: bytes, options: Options, path: Path) -> tuple[list[str], 
 
 
 def _is_table(lines: Sequence[str], dialect: Dialect) -> bool:
-    """Whether most of the lines below the header are rows with a number."""
-    rows = [
-        split_line(line, dialect.delimiter) for line in lines[dialect.first_line - 1 :][:200] if line.strip()
-    ]
+    """Whether most of the lines below the header are rows with a number, or rows of missing values."""
+    start = dialect.first_line - 1
+    rows = [split_line(line, dialect.delimiter) for line in lines[start : start + 200] if line.strip()]
+    whole = [row for row in rows if len(row) == len(dialect.fields)]
     good = sum(
-        len(row) == len(dialect.fields) and any(is_number(cell, dialect.decimal) for cell in row)
-        for row in rows
+        any(is_number(cell, dialect.decimal) for cell in row) or all(map(is_missing, row)) for row in whole
     )
     return good > 0.7 * len(rows) and not lines[0].lstrip().startswith(("{", "[", "<"))
 

@@ -13,8 +13,9 @@ from typing import Protocol
 from flexid_cli.errors import InputError, UsageError
 from flexid_cli.units import parse_unit
 
-MISSING = ("", "NaN", "nan", "NAN", "N/A", "n/a", "NA", "#N/A", "-", "--", "null", "NULL", "None", "none") + (
-    "-nan", "+nan", "-NaN", "+NaN", "-nan(ind)", "nan(ind)", "1.#QNAN", "-1.#IND", "1.#IND",  # C's own words
+MISSING = (
+    "", "NaN", "nan", "NAN", "N/A", "n/a", "NA", "#N/A", "-", "--", "null", "NULL", "None", "none",
+    "-nan", "+nan", "-NaN", "+NaN", "-nan(ind)", "nan(ind)", "1.#QNAN", "-1.#IND", "1.#IND",
 )  # fmt: skip
 WHITESPACE = " "
 _COMMENTS = ("#", "%", "//")

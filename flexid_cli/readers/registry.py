@@ -124,17 +124,11 @@ def _reader_of(path: Path, csv: CsvOptions | None) -> Reader:
             return reader
     if path.is_dir():
         raise InputError(f"{path} is a folder without a rosbag2 recording", f"name the files; {_FORMATS}")
-    _explain_text(path, csv)
+    text = readers(csv)[-1]
+    if path.name.lower().endswith(text.suffixes):
+        text.channels([path])  # raises the reason why this table is none
+        return text
     raise InputError(f"{path} is of no known format", _FORMATS)
-
-
-def _explain_text(path: Path, csv: CsvOptions | None) -> None:
-    """Raise the reason why a file that is named like a text table is not one."""
-    from flexid_cli.readers.csv import CsvReader
-
-    reader = CsvReader(csv)
-    if path.name.lower().endswith(reader.suffixes):
-        reader.channels([path])
 
 
 def _head(path: Path) -> bytes:

@@ -42,6 +42,7 @@ FASTEST_TURN = 1e4  # rad/s at the encoder; spindles end near it
 FASTEST_SLIDE = 100.0  # m/s
 MOTION_TOLERANCE = 0.02
 MOTION_BLOCKS = 200
+FLEXIBLE = (0.5, 2.0)  # near a resonance the two sides do move differently far
 _TIME_NAME = re.compile(
     r"(?:\w*?[_. ])?(?:time|t|timestamp|time_?stamp|stamp|zeit|seconds?|secs?|epoch|clock)"
     r"(?:[_. ]?(?:s|sec|secs|seconds?|ms|msec|us|µs|usec|ns|nsec|nanos|millis|micros))?"
@@ -495,7 +496,7 @@ def _damage_of(track: Track) -> list[str]:
     texts = [
         (
             clock.gaps,
-            f"{_count(clock.gaps, 'gap')} longer than {track.limit_ns / NS:.4g} s, {clock.lost_s:.4g} s in all",
+            f"{_count(clock.gaps, 'gap')} above {track.limit_ns / NS:.4g} s, in all {clock.lost_s:.4g} s",
         ),
         (clock.bridged, f"{_count(clock.bridged, 'missing sample')} interpolated in short gaps"),
         (
@@ -573,7 +574,7 @@ def _check_motions(segments: Sequence[Segment], config: Config) -> list[str]:
         words = f"motor_position and joint_position hardly move together (correlation {correlation:.2f})"
         return [f"{words}; are they of one axis?"]
     ratio = ratio if correlation > 0 else -ratio
-    if abs(ratio - 1.0) <= 0.05 or abs(correlation) < 0.9:
+    if FLEXIBLE[0] <= ratio <= FLEXIBLE[1] or abs(correlation) < 0.9:
         return []
     cause = _cause_of(ratio, config) if abs(correlation) > 0.99 else None
     text = f"at the joint side, joint_position moves {ratio:.5g} times as far as motor_position"

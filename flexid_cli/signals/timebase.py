@@ -274,10 +274,12 @@ def _lies_over(before: IntArray, late: IntArray, period: float, limit: float) ->
     low, high = int(late.min()), int(late.max())
     if int(before.max()) - low < GAP_PERIODS * period:
         return False
-    near = np.count_nonzero((before > low - period / 2) & (before < high + period / 2))
-    cover = (near + late.size) * period / (high - low + period)
-    if cover > 1.5 and near > 0:
-        return True
+    near = before[(before > low - period / 2) & (before < high + period / 2)]
+    if near.size >= min(RESET_RUN, late.size):
+        first, last = int(near.min()), int(near.max())
+        both = near.size + np.count_nonzero((late >= first) & (late <= last))
+        if both * period > 1.5 * (last - first + period):
+            return True
     older, newer = before[before < low], before[before > high]
     apart = [low - int(older.max())] if older.size else []
     apart += [int(newer.min()) - high] if newer.size else []

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from flexid_cli.config.load import parse_config
@@ -169,6 +169,7 @@ def test_a_reset_keeps_every_sample(seed, at, back):
     columns = columns_of(seed)
     time = columns["t"].copy()
     time[at:] -= back
+    assume(abs(time[-1]) > 0.05)  # else the second stretch ends where the first began: swapped, not reset
     result = build(columns | {"t": time})
     assert [s.samples for s in result.segments] == [at, SAMPLES - at]
     assert result.clocks[0].resets == 1

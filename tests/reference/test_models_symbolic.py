@@ -15,11 +15,14 @@ from flexid_cli.models.rigid import Rigid
 from flexid_cli.models.two_encoders import TwoEncoders, TwoEncodersStructured
 from flexid_cli.pipeline.chain import Chain, ChainSettings
 from flexid_cli.pipeline.columns import Columns
+from flexid_cli.pipeline.derivatives import differentiate
 from flexid_cli.signals.recording import Recording, Segment
 
 t, g = sp.symbols("t g", real=True)
 SYMBOLS = {name: sp.Symbol(name) for name in "Jm K JL FVm FV FSm FS MX MY c kg q0".split()}
 SYMBOLS["offset"] = sp.Symbol("offset")
+# Over a small motion the constant of the equation is the offset together with the gravity torque at q0.
+SYMBOLS["Q0"] = SYMBOLS["offset"]
 Jm, K, JL, FVm, FV, FSm, FS, MX, MY, c, kg, q0, offset = (
     SYMBOLS[n] for n in "Jm K JL FVm FV FSm FS MX MY c kg q0 offset".split()
 )
@@ -108,20 +111,21 @@ def test_gravity_terms_enter_with_the_sign_of_the_load_equation(form: str, gravi
     assert sp.simplify(residual - without + gravity) == 0
 
 
-def test_two_encoder_blocks_are_the_equations_of_motion():
+def two_encoder_equations() -> dict[str, sp.Expr]:
+    """The residual that each block's name stands for, from the equations of motion, with the spring's zero."""
     gravity = MX * g * sp.cos(q) + MY * g * sp.sin(q)
-    z = c / K
-    motor = (motor_equation() - K * (qm - q - z) + K * (qm - q)).subs(offset, 0)
-    load = load_equation(gravity) - K * (qm - q - z) + K * (qm - q)
-    assert sp.simplify(block_residual(TwoEncoders(), 0, SYMBOLS) - motor) == 0
-    assert sp.simplify(block_residual(TwoEncoders(), 1, SYMBOLS) - load) == 0
+    motor = motor_equation().subs(offset, 0) + c
+    load = load_equation(gravity) + c
+    return {"motor": motor, "load": load, "total": motor - load, "torsion": -load / K}
 
 
-def test_structured_blocks_are_the_sum_and_the_torsion_equation():
-    motor, load = (block_residual(TwoEncoders(), k, SYMBOLS) for k in (0, 1))
-    total, torsion = (block_residual(TwoEncodersStructured(), k, SYMBOLS) for k in (0, 1))
-    assert sp.simplify(total - (motor - load)) == 0
-    assert sp.simplify(torsion + load / K) == 0
+@pytest.mark.parametrize("model", [TwoEncoders(), TwoEncodersStructured()])
+def test_two_encoder_blocks_are_the_equations_of_motion(model):
+    for index, block in enumerate(model.blocks):
+        difference = block_residual(model, index, SYMBOLS) - two_encoder_equations()[block.name]
+        assert sp.nsimplify(sp.expand(difference)) == 0
+    # Two independent combinations of the two equations: the pair has the same parameters and solutions.
+    assert len({block.name for block in model.blocks}) == 2
 
 
 def test_rigid_is_the_sum_for_an_infinite_stiffness():
@@ -261,6 +265,7 @@ DURATION = 16.0
 WIDTH = 0.05
 
 
+@cache
 def motion(gravity: sp.Expr, extra_offset: float) -> Recording:
     """A record that satisfies the equations of motion exactly: q(t) chosen, qm and the torque computed."""
     path = sp.Float(0.06) * sp.sin(2.1 * t) + sp.Float(0.05) * sp.sin(5.7 * t + 0.4) + sp.Float(0.012) * sp.cos(
@@ -299,8 +304,6 @@ class Exact:
         chain, period = self.columns.chain, 1.0 / RATE
         self.signs = {}
         for name, x in (("sign_motor", segment.motor_position), ("sign_joint", segment.joint_position)):
-            from flexid_cli.pipeline.derivatives import differentiate
-
             velocity = differentiate(x, 1, period, half_width=chain.half_width)
             self.signs[name] = np.tanh(velocity / WIDTH)
 
@@ -319,8 +322,7 @@ def relative_residual(model, theta: np.ndarray, source) -> list[float]:
     return result
 
 
-# The derivative is exact to 1e-6 at the band's edge and much better below; tanh of the fastest reversals has a
-# little power beyond it, which the decimation's stop band (its ripple to the eighth order) lets through.
+# The chain's promise: at the edge of its band the second derivative is right to 1e-6 and the fourth to 2e-6.
 RESIDUAL = 2e-6
 
 
@@ -339,7 +341,7 @@ def test_two_encoder_equations_hold_on_an_analytic_motion(model):
     ("form", "gravity", "extra"),
     [
         ("none", sp.Integer(0), {"offset": 12.0}),
-        ("spring", kg * q, {"offset": 12.0, "kg": -480.0}),
+        ("spring", kg * q, {"Q0": 12.0, "kg": -480.0}),
         ("moments", MX * g * sp.cos(q) + MY * g * sp.sin(q), {"offset": 12.0}),
     ],
 )
@@ -358,7 +360,7 @@ def test_the_analytic_motion_would_show_a_wrong_sign(symbol: str):
     source = Exact(motion(MX * g * sp.cos(q) + MY * g * sp.sin(q), 12.0))
     theta = theta_of(model, offset=12.0)
     theta[[p.symbol for p in model.parameters].index(symbol)] *= -1.0
-    assert max(relative_residual(model, theta, source)) > 50.0 * RESIDUAL
+    assert max(relative_residual(model, theta, source)) > 500.0 * RESIDUAL
 
 
 def test_the_joint_position_is_rebuilt_as_equation_14():

@@ -100,6 +100,10 @@ class TestResets:
         stamps = np.concatenate([regular(1000), regular(1000, start=1000 * MS - 20 * MS)])
         assert find_resets(stamps, 3.5 * MS) == [1000]
 
+    def test_long_stretch_that_ends_over_a_short_one(self):
+        stamps = np.concatenate([regular(100), regular(1400, start=-400 * MS)])
+        assert find_resets(stamps, 3.5 * MS) == [100]
+
     def test_step_back_of_two_samples_is_disorder(self):
         stamps = np.concatenate([regular(1000), regular(1000, start=998 * MS)])
         assert find_resets(stamps, 3.5 * MS) == []
