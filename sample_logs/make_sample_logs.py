@@ -92,8 +92,12 @@ def main(folder: Path) -> None:
 
 def write_sums(folder: Path) -> None:
     """SHA-256 of every data file, in the format of sha256sum."""
-    files = sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix != ".py" and p.name != "SHA256SUMS")
-    lines = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(folder).as_posix()}\n" for p in files]
+    files = sorted(
+        p for p in folder.rglob("*") if p.is_file() and p.suffix != ".py" and p.name != "SHA256SUMS"
+    )
+    lines = [
+        f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(folder).as_posix()}\n" for p in files
+    ]
     (folder / "SHA256SUMS").write_text("".join(lines), encoding="utf-8")
 
 

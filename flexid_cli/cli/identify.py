@@ -117,8 +117,8 @@ def run_identify(
 
 
 def _inputs(logs: Sequence[Path], raw: RawLog) -> list[InputFile]:
-    from flexid_cli.report.document import InputFile
     from flexid_cli.readers.digest import digest
+    from flexid_cli.report.document import InputFile
 
     notes = tuple(note.message for note in raw.notes)
     return [

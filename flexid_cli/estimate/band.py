@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -159,7 +160,9 @@ def usable_band(recording: Recording, *, joint: bool) -> float:
         floor = np.median(shaped[frequency > 0.3 * rate])
         above = frequency[1:][shaped[1:] > SIGNAL_TO_NOISE * floor]
         edges.append(float(above[-1]) if above.size else rate * MAX_BAND_OVER_RATE)
-    return min(*edges, MAX_BAND_OVER_RATE * rate) if len(edges) > 1 else min(edges[0], MAX_BAND_OVER_RATE * rate)
+    return (
+        min(*edges, MAX_BAND_OVER_RATE * rate) if len(edges) > 1 else min(edges[0], MAX_BAND_OVER_RATE * rate)
+    )
 
 
 def torque_band(recording: Recording) -> float:
@@ -196,7 +199,13 @@ def find_resonance(recording: Recording, gravity_m_per_s2: float) -> float | Non
     return best[0] if best else None
 
 
-def _resonance_at(recording: Recording, band: float, solver, gravity: float):  # type: ignore[no-untyped-def]
+def _resonance_at(
+    recording: Recording,
+    band: float,
+    solver: Callable[[Columns], tuple[float, float] | None],
+    gravity_m_per_s2: float,
+) -> tuple[float, float] | None:
+    """Resonance by ``solver`` in one band, or None where it has no meaning there."""
     rate = recording.sample_rate_hz
     decimation = max(1, int(0.5 * DECIMATION_EDGE * rate / band))
     cutoff = 3.0 * band if decimation > 1 else band
@@ -204,7 +213,9 @@ def _resonance_at(recording: Recording, band: float, solver, gravity: float):  #
         ChainSettings(rate, lowpass_cutoff_hz=cutoff if cutoff < 0.4 * rate else None, decimation=decimation)
     )
     try:
-        columns = Columns(recording, chain, min(SIGN_BAND * band, MAX_BAND_OVER_RATE * rate), gravity)
+        columns = Columns(
+            recording, chain, min(SIGN_BAND * band, MAX_BAND_OVER_RATE * rate), gravity_m_per_s2
+        )
         return solver(columns) if columns.segments else None
     except DataError:
         return None
@@ -226,12 +237,14 @@ def _resonance_motor(columns: Columns) -> tuple[float, float] | None:
 
 def _resonance_both(columns: Columns) -> tuple[float, float] | None:
     """sqrt(K (1/Jm + 1/JL)) / 2 pi and the largest relative standard error of K, Jm, JL, equation by equation."""
-    motor, load = TwoEncoders.blocks
+    motor = TwoEncoders.blocks[0]
     W = np.column_stack([columns(*c) for c in motor.columns[1:]])
     first = solve(W, columns("torque", 0))
     Jm, K = first.estimate[[0, 3]]
     # q'' regressed on torsion is K/JL; the reverse would be drawn to zero by noise in q''.
-    W = np.column_stack([columns("torsion", 0), columns("joint", 1), columns("sign_joint", 0), columns("one", 0)])
+    W = np.column_stack(
+        [columns("torsion", 0), columns("joint", 1), columns("sign_joint", 0), columns("one", 0)]
+    )
     second = solve(W, columns("joint", 2))
     ratio = second.estimate[0]
     if not (Jm > 0.0 and K > 0.0 and ratio > 0.0):

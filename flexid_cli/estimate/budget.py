@@ -43,14 +43,20 @@ class Nuisance:
     Attributes
     ----------
     value, stderr : float
-        Its estimate, one Gauss-Newton step from the solution, and robust standard error.
-    shift : ndarray, shape (p,)
-        What the parameters would change by if it were part of the model.
+        Its estimate, one Gauss-Newton step from the solution, and robust standard error; infinite where the
+        parameters take up all that it could do.
+    per_unit : ndarray, shape (p,)
+        What the parameters change by for each unit of it that is neglected.
     """
 
     value: float
     stderr: float
-    shift: Array
+    per_unit: Array
+
+    def shift(self, at_most: float) -> Array:
+        """Standard error that neglecting it adds, shape (p,); ``at_most`` is its size where it is not known."""
+        size = float(np.hypot(self.value, self.stderr))
+        return self.per_unit * (size if np.isfinite(size) else at_most)
 
 
 def noise_levels(recording: Recording) -> NoiseLevels:
@@ -162,7 +168,9 @@ def torque_hold(model: Model, result: FitResult, columns: Columns) -> Array:
     return -_solve_normal(result, result.jacobian.T @ column)
 
 
-def reversal_width(model: Model, result: FitResult, columns: Columns, lengths: Sequence[int]) -> Nuisance | None:
+def reversal_width(
+    model: Model, result: FitResult, columns: Columns, lengths: Sequence[int]
+) -> Nuisance | None:
     """Relative error of the reversal width v0, and what it would do to the parameters; None for a plain sign."""
     width = columns.reversal_velocity
     if not width:
@@ -207,11 +215,11 @@ def _nuisance(result: FitResult, gradients: Sequence[Array], lengths: Sequence[i
     free = column - J @ projection
     energy = float(free @ free)
     if energy <= 1e-12 * float(column @ column):
-        return Nuisance(0.0, float("inf"), np.full(result.theta.size, np.inf))
+        return Nuisance(0.0, float("inf"), -projection)
     value = -float(free @ residual) / energy
     scores = (free * (residual + value * free)).reshape(len(gradients), -1).sum(axis=0)
     covariance = robust_covariance(scores[:, None], np.array([[1.0 / energy]]), lengths).covariance
-    return Nuisance(value, float(np.sqrt(covariance[0, 0])), -projection * value)
+    return Nuisance(value, float(np.sqrt(covariance[0, 0])), -projection)
 
 
 def _solve_normal(result: FitResult, right: Array) -> Array:

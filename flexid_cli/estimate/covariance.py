@@ -41,7 +41,7 @@ class RobustCovariance:
 
 def series_length(rows: int, parameters: int) -> int:
     """Number of cosines B for a record of ``rows``."""
-    wanted = round(SERIES_FACTOR * rows**SERIES_POWER)
+    wanted = int(SERIES_FACTOR * float(rows) ** SERIES_POWER + 0.5)
     return max(min(wanted, rows - 1), min(parameters + 2, rows - 1), 1)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flexid_cli.errors import DataError
 from flexid_cli.estimate.covariance import robust_covariance
-from flexid_cli.estimate.least_squares import numerical_rank
+from flexid_cli.estimate.least_squares import numerical_rank, triangle
 from flexid_cli.models.base import Block, Model
 
 Array = NDArray[np.float64]
@@ -112,7 +112,7 @@ def fit(
             "record longer, or lower pipeline.decimation (raise pipeline.band_hz)",
         )
     # The cost depends on the columns through their triangular factor only: iterate on that.
-    triangles = [np.linalg.qr(M, mode="r") for M in matrices]
+    triangles = [triangle(M) for M in matrices]
     weights = _initial_weights(triangles, weighted=weighted)
     theta, weights, converged = _iterate(model, triangles, theta, weights, rows, weighted=weighted)
     return _finish(model, matrices, theta, weights, lengths, converged, covariance)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flexid_cli.errors import DataError
 from flexid_cli.estimate import band, budget, paper_route, summary
 from flexid_cli.estimate.fit import block_matrices, block_matrix, fit
-from flexid_cli.estimate.least_squares import solve
+from flexid_cli.estimate.least_squares import solve, triangle
 from flexid_cli.estimate.result import Identification, ModelResult, Skipped
 from flexid_cli.estimate.reversal import fit_reversal_velocity
 from flexid_cli.estimate.solution import Solution
@@ -70,7 +70,9 @@ def identify(recording: Recording, config: Config) -> Identification:
         models.append(_solve(recording, config, "rigid", None))
     if not models:
         reasons = "; ".join(f"{s.id}: {s.reason}" for s in skipped)
-        raise DataError(f"no model can be solved on this recording: {reasons}", "record what the reasons name")
+        raise DataError(
+            f"no model can be solved on this recording: {reasons}", "record what the reasons name"
+        )
     return Identification(tuple(models), tuple(skipped), tuple(recording.notes))
 
 
@@ -120,8 +122,6 @@ def make_columns(recording: Recording, config: Config, tuning: band.Tuning) -> C
 def _two_encoders(recording: Recording, config: Config, f1: float | None) -> Solution:
     tuning = band.choose_tuning(recording, config, "two_encoders", f1)
     columns = make_columns(recording, config, tuning)
-    linear = TwoEncoders()
-
 
     def cost() -> float:
         return _log_residual(columns, TOTAL.columns)
@@ -190,9 +190,9 @@ def _motor_only(recording: Recording, config: Config, f1: float | None) -> Solut
 def _log_residual(columns: Columns, names: Sequence[tuple[str, int]]) -> float:
     """Logarithm of the residual's size when the first column is regressed on the others."""
     W = np.column_stack([columns(*c) for c in names])
-    R = np.linalg.qr(W / np.linalg.norm(W, axis=0), mode="r")
+    R = triangle(W / np.linalg.norm(W, axis=0))
     rest = R[:, 0] - R[:, 1:] @ np.linalg.lstsq(R[:, 1:], R[:, 0], rcond=None)[0]
-    return float(np.log(max(np.linalg.norm(rest), 1e-300)))
+    return float(np.log(max(float(np.linalg.norm(rest)), 1e-300)))
 
 
 def _motor_start(columns: Columns, model: MotorOnly) -> Array:

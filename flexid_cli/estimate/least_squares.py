@@ -101,6 +101,12 @@ def solve(W: Array, Y: Array) -> LeastSquares:
     )
 
 
+def triangle(W: Array) -> Array:
+    """Triangular factor R of W = QR, shape (min(r, p), p)."""
+    R = np.linalg.qr(W, mode="r")
+    return np.asarray(R, dtype=np.float64)
+
+
 def numerical_rank(singular_values: Array, rows: int) -> int:
     """Singular values above rows times machine precision times the largest one."""
     tolerance = max(rows, singular_values.size) * np.finfo(np.float64).eps * singular_values[0]

@@ -25,7 +25,9 @@ Make = Callable[[Parameter, float, float, float], Estimate]
 _SIGNS = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 
 
-def regression(solution: Solution, config: Config, *, make: Make) -> tuple[tuple[Estimate, ...], dict[str, Any]]:
+def regression(
+    solution: Solution, config: Config, *, make: Make
+) -> tuple[tuple[Estimate, ...], dict[str, Any]]:
     """Linear least squares for X1..X7 beside the columns that the paper dropped, and the J test.
 
     Returns

@@ -29,6 +29,7 @@ METHOD = "paper: 2 sigma, independent residuals"
 LEVEL = 0.9544997361036416
 NORMAL = 1e9
 
+
 class PaperRegression:
     """Eqs. (18) to (20) as printed: seven columns, the derivatives of the sign and gravity left out."""
 
@@ -53,6 +54,7 @@ class PaperRegression:
         """Constant: the equation is linear in X1..X7."""
         signs = np.where(np.arange(theta.size) < 2, 1.0, -1.0)
         return (np.vstack([np.zeros(theta.size), np.diag(signs)]),)
+
 
 def solve_paper(columns: Columns, config: Config, model_id: str, tuning: Tuning) -> ModelResult:
     """Reproduce Table 1 (both encoders) or Tables 2 and 3 (motor alone) on this recording.
@@ -84,20 +86,20 @@ def solve_paper(columns: Columns, config: Config, model_id: str, tuning: Tuning)
         correlation=correlation,
     )
 
+
 def _two_sigma(estimate: Estimate) -> Estimate:
     if estimate.value is None or estimate.stderr is None:
         return estimate
     half = 2.0 * estimate.stderr
     return replace(estimate, interval=Interval(estimate.value - half, estimate.value + half, LEVEL, METHOD))
 
+
 def _table_3(solution: Solution) -> tuple[tuple[str, ...], Array, tuple[Estimate, ...]]:
     """Physical parameters by the inversion of Table 3, standard errors by the delta method."""
     X = solution.result.theta
     # Complex step: exact to rounding, for the inversion is a rational function.
-    step = 1e-30
-    J = np.column_stack(
-        [np.imag(paper_inversion(X + 1j * step * abs(x) * unit)) / (step * abs(x)) for x, unit in zip(X, np.eye(7), strict=True)]
-    )  # fmt: skip
+    steps = np.diag(1e-30 * np.abs(X))
+    J = np.column_stack([np.imag(paper_inversion(X + 1j * step)) / step.sum() for step in steps])
     covariance = J @ solution.result.covariance @ J.T
     recording = solution.columns.recording
     physical = tuple(
@@ -119,5 +121,3 @@ def _table_3(solution: Solution) -> tuple[tuple[str, ...], Array, tuple[Estimate
     symbols: tuple[str, ...] = tuple(p.symbol for p in PHYSICAL[: J.shape[0]])
     scale = np.sqrt(np.diag(covariance))
     return symbols, covariance / np.outer(scale, scale), physical
-
-__all__ = ["PaperRegression", "Parameter", "solve_paper"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flexid_cli.estimate import budget, overdetermination
 from flexid_cli.estimate.result import Estimate, Fit, ModelResult, PipelineSummary, Spectrum, Trace
 from flexid_cli.estimate.solution import Solution
-from flexid_cli.estimate.verdict import correlated_with, judge, undetermined
+from flexid_cli.estimate.verdict import correlated_with, demoted, judge, model_doubt, undetermined
 from flexid_cli.models.base import Model, Parameter, unit_of
 from flexid_cli.pipeline.tuning import DECIMATION_EDGE
 
@@ -30,6 +30,8 @@ DERIVED = (
     Parameter("inertia_ratio", "JL/Jm", "ratio"),
 )
 SIGNIFICANT_DELAY_SAMPLES = 0.1
+SIGNIFICANT_SIGMA = 3.0
+HALF_SAMPLE_TOLERANCE = 0.2
 SPECTRUM_SEGMENT_S = 8.0
 # A uniform doubt between zero and the full shift has this standard deviation about zero.
 UNIFORM = 1.0 / np.sqrt(3.0)
@@ -62,7 +64,8 @@ def summarise(solution: Solution, config: Config, *, regression: bool = True) ->
     uncertainty = total_uncertainty(solution, config)
     parameters, theta, covariance = _reported(solution.model, solution.result.theta, uncertainty.covariance)
     estimates = _estimates(solution, config, uncertainty, parameters, theta, covariance)
-    correlation = _correlation(covariance)
+    fitted = _fit(solution)
+    doubt = model_doubt(estimates, fitted.fit_percent)
     tests: dict[str, dict[str, Any]] = {"torque_delay": _delay_test(uncertainty.delay, solution)}
     free: tuple[Estimate, ...] = ()
     if regression and solution.model.id == "motor_only":
@@ -75,21 +78,21 @@ def summarise(solution: Solution, config: Config, *, regression: bool = True) ->
         method=solution.method,
         method_reason=solution.method_reason,
         equation=solution.model.equation,
-        parameters=estimates,
-        regression=free,
-        derived=_derived(solution, config, uncertainty),
+        parameters=tuple(demoted(e, doubt) for e in estimates),
+        regression=tuple(demoted(e, doubt) for e in free),
+        derived=tuple(demoted(e, doubt) for e in _derived(solution, config, uncertainty)),
         correlation_names=tuple(p.symbol for p in parameters),
-        correlation=correlation,
+        correlation=_correlation(covariance),
         condition_number=solution.result.condition_number,
         rank=solution.result.rank,
         columns=solution.result.theta.size,
-        fit=_fit(solution),
+        fit=fitted,
         pipeline=pipeline_summary(solution),
         trace=_trace(solution),
         spectrum=_spectrum(solution.columns),
         added_terms=tuple(effects),
         tests=tests,
-        warnings=_warnings(solution, uncertainty, config),
+        warnings=_warnings(solution, uncertainty, config, doubt),
     )
 
 
@@ -107,10 +110,10 @@ def total_uncertainty(solution: Solution, config: Config) -> Uncertainty:
         if torque.hold != "instant":
             shifts["the torque held between samples"] = held * budget.torque_hold(model, result, columns)
         if torque.hold is None and torque.delay_s is None:
-            shifts["the torque's timing"] = _with_own_error(delay)
+            shifts["the torque's timing"] = delay.shift(at_most=0.5 / columns.recording.sample_rate_hz)
         width = budget.reversal_width(model, result, columns, lengths)
         if width is not None:
-            shifts["the width of the friction reversal"] = _with_own_error(width)
+            shifts["the width of the friction reversal"] = width.shift(at_most=1.0)
         shifts["the band of the friction's velocity"] = budget.sign_band(model, result, columns)
     covariance = result.covariance + sum(np.outer(s, s) for s in shifts.values())
     random = np.maximum(np.diag(result.covariance), np.finfo(float).tiny)
@@ -118,16 +121,10 @@ def total_uncertainty(solution: Solution, config: Config) -> Uncertainty:
     dof = np.minimum(result.degrees_of_freedom * share**2, 1e6)
     largest = []
     for k in range(result.theta.size):
-        name = max(shifts, key=lambda n, k=k: abs(shifts[n][k]), default="")
+        sizes = {name: abs(float(shift[k])) for name, shift in shifts.items()}
+        name = max(sizes, key=sizes.__getitem__, default="")
         largest.append(name if name and shifts[name][k] ** 2 > random[k] else "")
     return Uncertainty(covariance, dof, tuple(largest), delay)
-
-
-def _with_own_error(nuisance: budget.Nuisance) -> Array:
-    """Shift enlarged by the nuisance's own standard error."""
-    if nuisance.value == 0.0 or not np.isfinite(nuisance.stderr):
-        return np.zeros_like(nuisance.shift)
-    return nuisance.shift * float(np.hypot(1.0, nuisance.stderr / nuisance.value))
 
 
 def _reported(model: Model, theta: Array, covariance: Array) -> tuple[tuple[Parameter, ...], Array, Array]:
@@ -216,27 +213,27 @@ def fitted_resonance(model: Model, theta: Array) -> float | None:
 
 
 def _derived(solution: Solution, config: Config, uncertainty: Uncertainty) -> tuple[Estimate, ...]:
-    """Resonance, antiresonance and inertia ratio, by the delta method."""
-    theta = solution.result.theta
-    if fitted_resonance(solution.model, theta) is None:
-        return ()
+    """Resonance, antiresonance and inertia ratio by the delta method, where they exist."""
     symbols = [p.symbol for p in solution.model.parameters]
+    if "K" not in symbols:
+        return ()
     index = [symbols.index(s) for s in ("Jm", "K", "JL")]
-    Jm, K, JL = theta[index]
-    f1 = np.sqrt(K * (1.0 / Jm + 1.0 / JL)) / (2.0 * np.pi)
-    fa = np.sqrt(K / JL) / (2.0 * np.pi)
-    ratio = JL / Jm
-    reduced = 1.0 / Jm + 1.0 / JL
-    gradients = (
-        (f1, np.array([-0.5 * f1 / (Jm**2 * reduced), 0.5 * f1 / K, -0.5 * f1 / (JL**2 * reduced)])),
-        (fa, np.array([0.0, 0.5 * fa / K, -0.5 * fa / JL])),
-        (ratio, np.array([-ratio / Jm, 0.0, 1.0 / Jm])),
-    )
+    Jm, K, JL = (float(x) for x in solution.result.theta[index])
     covariance = uncertainty.covariance[np.ix_(index, index)]
     dof = float(np.min(uncertainty.degrees_of_freedom[index]))
+    found = []
+    for parameter, square, gradient in (
+        (DERIVED[0], K / Jm + K / JL, np.array([-K / Jm**2, 1.0 / Jm + 1.0 / JL, -K / JL**2])),
+        (DERIVED[1], K / JL, np.array([0.0, 1.0 / JL, -K / JL**2])),
+    ):
+        if square > 0.0:
+            frequency = float(np.sqrt(square)) / (2.0 * np.pi)
+            g = gradient * 0.5 * frequency / square
+            found.append((parameter, frequency, g))
+    found.append((DERIVED[2], JL / Jm, np.array([-JL / Jm**2, 0.0, 1.0 / Jm])))
     return tuple(
-        _judge(solution, config, parameter, float(value), float(np.sqrt(g @ covariance @ g)), dof)
-        for parameter, (value, g) in zip(DERIVED, gradients, strict=True)
+        _judge(solution, config, parameter, value, float(np.sqrt(g @ covariance @ g)), dof)
+        for parameter, value, g in found
     )
 
 
@@ -311,7 +308,9 @@ def _steps(solution: Solution, trimmed: float) -> tuple[str, ...]:
             f" {settings.lowpass_cutoff_hz:.4g} Hz (-6 dB)"
         )
     if settings.derivative == "exact":
-        steps.append(f"exact derivative, {2 * solution.columns.chain.half_width + 1}-point maximally flat difference")
+        steps.append(
+            f"exact derivative, {2 * solution.columns.chain.half_width + 1}-point maximally flat difference"
+        )
     else:
         steps.append("central difference, repeated for higher derivatives (eq. 22)")
     width = solution.columns.reversal_velocity
@@ -338,28 +337,34 @@ def _delay_test(delay: budget.Nuisance, solution: Solution) -> dict[str, Any]:
     }
 
 
-def _warnings(solution: Solution, uncertainty: Uncertainty, config: Config) -> tuple[str, ...]:
-    warnings = []
-    rate = solution.columns.recording.sample_rate_hz
-    delay = uncertainty.delay
-    samples = delay.value * rate
-    clear = np.isfinite(delay.stderr) and abs(delay.value) > 3.0 * delay.stderr
-    if clear and abs(samples) > SIGNIFICANT_DELAY_SAMPLES:
-        torque = config.signals.torque_role
-        cure = f"signals.{torque}.delay_s: {-delay.value:.3g}"
-        if abs(samples - 0.5) < 0.2 and config.signals.torque.hold is None:
-            cure = f"signals.{torque}.hold: sample"
-        warnings.append(
-            f"{solution.model.id}: the torque seems to act {1e3 * delay.value:.3g} ms ({samples:.2g} samples) after"
-            f" its stamp; if the drive's timing confirms it, set {cure}"
-        )
+def _warnings(solution: Solution, uncertainty: Uncertainty, config: Config, doubt: str) -> tuple[str, ...]:
+    model = solution.model.id
+    warnings = [f"{model}: {doubt}; no parameter counts as identified"] if doubt else []
+    # With physics missing the residuals' delay is a symptom, not a timing that could be set.
+    if not doubt:
+        warnings += _delay_warning(solution, uncertainty.delay, config)
     if not solution.result.converged:
-        warnings.append(f"{solution.model.id}: the fit did not settle; treat its numbers with care")
+        warnings.append(f"{model}: the fit did not settle; treat its numbers with care")
     f1, band = solution.tuning.f1_hz, solution.columns.chain.band_hz
-    if f1 and solution.model.id != "rigid" and band < f1:
+    if f1 and model != "rigid" and band < f1:
         warnings.append(
-            f"{solution.model.id}: the effective band ends at {band:.3g} Hz, below the resonance at {f1:.3g} Hz"
+            f"{model}: the effective band ends at {band:.3g} Hz, below the resonance at {f1:.3g} Hz"
         )
     return tuple(warnings)
 
 
+def _delay_warning(solution: Solution, delay: budget.Nuisance, config: Config) -> list[str]:
+    samples = delay.value * solution.columns.recording.sample_rate_hz
+    if not np.isfinite(delay.stderr) or abs(delay.value) < SIGNIFICANT_SIGMA * delay.stderr:
+        return []
+    if abs(samples) < SIGNIFICANT_DELAY_SAMPLES:
+        return []
+    role, torque = config.signals.torque_role, config.signals.torque
+    cure = f"signals.{role}.delay_s: {(torque.delay_s or 0.0) - delay.value:.3g}"
+    if torque.hold is None and abs(samples - 0.5) < HALF_SAMPLE_TOLERANCE:
+        cure = f"signals.{role}.hold: sample"
+    text = (
+        f"{solution.model.id}: the torque seems to act {1e3 * delay.value:.3g} ms ({samples:.2g} samples) after its"
+        f" stamp; if the drive's timing confirms it, set {cure}"
+    )
+    return [text]

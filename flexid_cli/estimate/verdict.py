@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +18,7 @@ Array = NDArray[np.float64]
 IDENTIFIED_PERCENT = 10.0
 WEAK_PERCENT = 50.0
 NAMED_CORRELATION = 0.9
+FORBIDDEN = "physics forbids a negative value"
 
 
 def judge(
@@ -70,7 +74,7 @@ def _verdict(
 ) -> tuple[Verdict, str]:
     because = f"; {doubt}" if doubt else ""
     if parameter.positive and interval.high < 0.0:
-        return "not_identifiable", "physics forbids a negative value: the model lacks something" + because
+        return "not_identifiable", FORBIDDEN + ": the model lacks something" + because
     if parameter.positive and value <= 0.0:
         return "not_identifiable", "the estimate is negative and its interval reaches zero" + because
     if relative is None or (interval.low <= 0.0 <= interval.high and relative > WEAK_PERCENT):
@@ -80,6 +84,29 @@ def _verdict(
     if relative > IDENTIFIED_PERCENT:
         return "weak", f"relative standard deviation {relative:.0f} %" + because
     return "identified", ""
+
+
+def model_doubt(estimates: Sequence[Estimate], fit_percent: float) -> str:
+    """Why no parameter of a model deserves `identified`, or nothing.
+
+    A parameter that physics forbids, or a torque of which the model leaves more unexplained than the relative
+    error that `identified` allows, shows that the model lacks something; its lack biases the others in a way that
+    no interval of this model covers.
+    """
+    forbidden = [e.symbol for e in estimates if e.reason.startswith(FORBIDDEN)]
+    if forbidden:
+        return f"{', '.join(forbidden)} came out with a sign that physics forbids: the model lacks something"
+    unexplained = 100.0 - fit_percent
+    if unexplained > IDENTIFIED_PERCENT:
+        return f"the model leaves {unexplained:.0f} % of the torque unexplained: it lacks something"
+    return ""
+
+
+def demoted(estimate: Estimate, doubt: str) -> Estimate:
+    """The estimate, no better than weak, for a doubt about the whole model."""
+    if not doubt or estimate.verdict != "identified":
+        return estimate
+    return replace(estimate, verdict="weak", reason=doubt)
 
 
 def correlated_with(correlation: Array, symbols: tuple[str, ...], index: int) -> str:

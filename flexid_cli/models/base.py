@@ -57,10 +57,25 @@ class Block:
 class Model(Protocol):
     """A model that is linear in its filtered columns, with coefficients that depend on the parameters."""
 
-    id: str
-    equation: str
-    parameters: tuple[Parameter, ...]
-    blocks: tuple[Block, ...]
+    @property
+    def id(self) -> str:
+        """Name of the model in configuration and report."""
+        ...
+
+    @property
+    def equation(self) -> str:
+        """The equation in the report's symbols."""
+        ...
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Parameters in the order of theta."""
+        ...
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Equations; the first predicts the motor torque, with coefficient one on its first column."""
+        ...
 
     def coefficients(self, theta: Array) -> tuple[Array, ...]:
         """Coefficients of each block's columns, shapes (columns,)."""

@@ -101,7 +101,9 @@ class Chain:
         if self.settings.decimation > 1:
             wanted = 3 * filters.DECIMATION_ORDER * self.settings.decimation
         else:
-            wanted = round(3 * self.settings.lowpass_order * self.settings.sample_rate_hz / (4 * self.band_hz))
+            wanted = round(
+                3 * self.settings.lowpass_order * self.settings.sample_rate_hz / (4 * self.band_hz)
+            )
         return min(wanted, int(MAX_TRIM_FRACTION * samples))
 
     def rows(self, samples: int) -> int:

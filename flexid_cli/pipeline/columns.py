@@ -79,9 +79,13 @@ class Columns:
         self.motor_velocity = [self.velocities.derivative(s.motor_position) for s in self.segments]
         self.joint: list[Array] = []
         self.joint_velocity: list[Array] = []
-        self._set_joint([s.motor_position if s.joint_position is None else s.joint_position for s in self.segments])
+        self._set_joint(
+            [s.motor_position if s.joint_position is None else s.joint_position for s in self.segments]
+        )
         positions = [(float(s.motor_position.min()), float(s.motor_position.max())) for s in self.segments]
-        self.centre = 0.5 * (min(p[0] for p in positions) + max(p[1] for p in positions)) if positions else 0.0
+        self.centre = (
+            0.5 * (min(p[0] for p in positions) + max(p[1] for p in positions)) if positions else 0.0
+        )
 
     @property
     def lengths(self) -> tuple[int, ...]:

@@ -95,7 +95,9 @@ def reach(kind: str, order: int, half_width: int) -> int:
     return order if kind == "central" else half_width * ((order + 1) // 2)
 
 
-def differentiate(x: Array, order: int, period_s: float, *, kind: str = "exact", half_width: int = 8) -> Array:
+def differentiate(
+    x: Array, order: int, period_s: float, *, kind: str = "exact", half_width: int = 8
+) -> Array:
     """Derivative of ``order`` of a uniformly sampled signal, without phase shift.
 
     Parameters

@@ -123,8 +123,8 @@ def simulate(
     """
     sensors = sensors or Sensors()
     noise = np.random.default_rng(seed).normal(0.0, 1.0, reference.size) * sensors.torque_noise
-    parameters = np.array([v for v in asdict(axis).values()], dtype=np.float64)
-    gains = np.array([v for v in asdict(controller).values()], dtype=np.float64)
+    parameters = np.array(list(asdict(axis).values()), dtype=np.float64)
+    gains = np.array(list(asdict(controller).values()), dtype=np.float64)
     rest = np.array([float(reference[0]), _rest_position(axis, float(reference[0])), 0.0, 0.0])
     torque, motor, joint = _closed_loop(
         parameters,
@@ -165,7 +165,7 @@ def _rest_position(axis: Axis, motor_position: float) -> float:
     return float(position)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _derivative(p, torque, x, out):  # type: ignore[no-untyped-def] # pragma: no cover
     qm, q, vm, v = x
     spring = p[1] * (qm - q)
@@ -176,7 +176,7 @@ def _derivative(p, torque, x, out):  # type: ignore[no-untyped-def] # pragma: no
     out[3] = (spring - p[5] * v - p[6] * np.tanh(v / p[11]) - gravity) / p[2]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True)
 def _closed_loop(p, gains, reference, state, period, substeps, motor_lsb, joint_lsb):  # type: ignore[no-untyped-def] # pragma: no cover
     n = reference.size
     torque = np.empty(n)
