@@ -139,7 +139,7 @@ def _lowpass(
     if f1 and model_id != "rigid":
         cutoff = max(cutoff, tune_filter(f1, HIGHEST_DERIVATIVE[model_id], m=order).wn_hz)
     if decimation == 1:
-        cutoff = band
+        cutoff = min(band, MAX_BAND_OVER_RATE * rate)
     return (order, cutoff) if cutoff < 0.4 * rate else (order, None)
 
 

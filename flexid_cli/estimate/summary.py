@@ -106,9 +106,10 @@ def total_uncertainty(solution: Solution, config: Config) -> Uncertainty:
         levels = budget.limited_torque_noise(model, result, columns, budget.noise_levels(columns.recording))
         shifts["encoder and torque noise in the columns"] = budget.noise_bias(model, result, columns, levels)
         torque = config.signals.torque
-        held = 1.0 if torque.hold == "sample" else UNIFORM
         if torque.hold != "instant":
-            shifts["the torque held between samples"] = held * budget.torque_hold(model, result, columns)
+            # Declared held, its damping has been applied; but no current controller makes exact steps.
+            held = UNIFORM * budget.torque_hold(model, result, columns)
+            shifts["the torque between its samples"] = held
         if torque.hold is None and torque.delay_s is None:
             shifts["the torque's timing"] = delay.shift(at_most=0.5 / columns.recording.sample_rate_hz)
         width = budget.reversal_width(model, result, columns, lengths)

@@ -342,14 +342,29 @@ def _delayed(role: str, signal: _Signal, config: Config, history: list[str]) -> 
         half = round(0.5 * signal.track.period_ns)
         if (config.signals.torque.hold or DEFAULT_TORQUE_HOLD) == "sample":
             shift += half
+            signal = replace(signal, track=_held(signal.track))
             history.append(
-                f"{role}: stamps moved {half / NS:g} s later, for each value is held for one sample"
+                f"{role}: each value is held for one sample: stamps moved {half / NS:g} s later, the hold's"
+                " damping sinc(f T) applied"
             )
         else:
             history.append(f"{role}: taken as measured at its stamp")
     return (
         replace(signal, track=replace(signal.track, stamps=signal.track.stamps + shift)) if shift else signal
     )
+
+
+def _held(track: Track) -> Track:
+    """Values as they act when each is held for one period T: damped by sinc(f T), to (w T)^4.
+
+    sinc(f T) is 1 - (w T)^2 / 24 + ..., and -(w T)^2 the second difference.
+    """
+    if not track.is_uniform:
+        return track
+    values = track.values.copy()
+    for first, stop in track.segments:
+        values[first + 1 : stop - 1] += np.diff(track.values[first:stop], 2) / 24.0
+    return replace(track, values=values)
 
 
 # --- alignment ------------------------------------------------------------

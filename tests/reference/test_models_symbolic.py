@@ -31,7 +31,15 @@ q, qm, torque = (sp.Function(n)(t) for n in ("q", "qm", "torque"))
 sign_motor, sign_joint, gravity_torque = (sp.Function(n)(t) for n in ("S", "SL", "Q"))
 
 PAPER_TRUTH = dict(
-    Jm=174.7996, K=20341.0458, JL=47.4458, FVm=235.91, FSm=41.4254, FV=83.1508, FS=8.4612, MX=-0.7241, MY=-53.4201
+    Jm=174.7996,
+    K=20341.0458,
+    JL=47.4458,
+    FVm=235.91,
+    FSm=41.4254,
+    FV=83.1508,
+    FS=8.4612,
+    MX=-0.7241,
+    MY=-53.4201,
 )
 GRAVITY = 9.81
 REGRESSION_THETA = np.array([PAPER_TRUTH[n] for n in ("Jm", "K", "JL", "FVm", "FV", "FSm")])
@@ -61,7 +69,9 @@ def column_symbols() -> dict[tuple[str, int], sp.Expr]:
         "sign_motor": sign_motor, "sign_joint": sign_joint, "one": sp.Integer(1),
         "gravity_cos": g * sp.cos(q), "gravity_sin": g * sp.sin(q),
     }  # fmt: skip
-    return {(name, d): signal.diff(t, d) if d else signal for name, signal in signals.items() for d in range(5)}
+    return {
+        (name, d): signal.diff(t, d) if d else signal for name, signal in signals.items() for d in range(5)
+    }
 
 
 def block_residual(model, index: int, theta: dict[str, sp.Expr]) -> sp.Expr:
@@ -212,7 +222,9 @@ def test_the_starting_point_is_exact_without_friction_and_close_with_it():
     start = motor_only.starting_point(motor_only.regression_coefficients(REGRESSION_THETA))
     # X5 exceeds Jm + JL by FV FVm / K, which passes to JL and, through K = JL / X1, to K.
     excess = PAPER_TRUTH["FV"] * PAPER_TRUTH["FVm"] / PAPER_TRUTH["K"] / PAPER_TRUTH["JL"]
-    np.testing.assert_allclose(start[:3] / REGRESSION_THETA[:3], [1.0, 1.0 + excess, 1.0 + excess], rtol=1e-11)
+    np.testing.assert_allclose(
+        start[:3] / REGRESSION_THETA[:3], [1.0, 1.0 + excess, 1.0 + excess], rtol=1e-11
+    )
     assert excess < 0.03
     assert start[3] + start[4] == pytest.approx(PAPER_TRUTH["FVm"] + PAPER_TRUTH["FV"])
 
@@ -268,8 +280,10 @@ WIDTH = 0.05
 @cache
 def motion(gravity: sp.Expr, extra_offset: float) -> Recording:
     """A record that satisfies the equations of motion exactly: q(t) chosen, qm and the torque computed."""
-    path = sp.Float(0.06) * sp.sin(2.1 * t) + sp.Float(0.05) * sp.sin(5.7 * t + 0.4) + sp.Float(0.012) * sp.cos(
-        11.9 * t + 1.0
+    path = (
+        sp.Float(0.06) * sp.sin(2.1 * t)
+        + sp.Float(0.05) * sp.sin(5.7 * t + 0.4)
+        + sp.Float(0.012) * sp.cos(11.9 * t + 1.0)
     )
     numbers = {SYMBOLS[k]: v for k, v in PAPER_TRUTH.items()} | {g: GRAVITY, q0: 0.0, kg: -480.0}
 
@@ -317,7 +331,9 @@ def relative_residual(model, theta: np.ndarray, source) -> list[float]:
     """Residual of each block over the size of its largest term, at the true parameters."""
     result = []
     for block, a in zip(model.blocks, model.coefficients(theta), strict=True):
-        terms = np.column_stack([coefficient * source(*name) for coefficient, name in zip(a, block.columns, strict=True)])
+        terms = np.column_stack(
+            [coefficient * source(*name) for coefficient, name in zip(a, block.columns, strict=True)]
+        )
         result.append(float(np.abs(terms.sum(axis=1)).max() / np.abs(terms).max()))
     return result
 
@@ -345,7 +361,9 @@ def test_two_encoder_equations_hold_on_an_analytic_motion(model):
         ("moments", MX * g * sp.cos(q) + MY * g * sp.sin(q), {"offset": 12.0}),
     ],
 )
-def test_motor_only_equation_holds_on_an_analytic_motion(form: str, gravity: sp.Expr, extra: dict[str, float]):
+def test_motor_only_equation_holds_on_an_analytic_motion(
+    form: str, gravity: sp.Expr, extra: dict[str, float]
+):
     recording = motion(gravity, 12.0)
     model = MotorOnly(form)
     source = Exact(recording)

@@ -37,7 +37,9 @@ def test_exact_derivative_of_a_sine_is_right_to_the_tolerance(order: int, band: 
         rounding = 20.0 * np.finfo(float).eps * (4.0 / PERIOD) ** order
         # The second derivative errs by up to 1e-6, so the fourth by twice that; the first errs a few times more
         # than the second on the same points.
-        first = abs(derivatives.response("exact", 1, 2.0 * np.pi * band, half_width) / (2.0 * np.pi * band) - 1.0)
+        first = abs(
+            derivatives.response("exact", 1, 2.0 * np.pi * band, half_width) / (2.0 * np.pi * band) - 1.0
+        )
         tolerance = (order // 2) * 1e-6 + (order % 2) * first
         assert np.abs(error).max() < 1.01 * tolerance * w**order + rounding
 
@@ -129,7 +131,9 @@ def test_response_is_what_differentiate_does_to_a_wave(kind: str, order: int):
     w = 0.9
     n = np.arange(300)
     wave = np.exp(1j * w * n)
-    parts = [derivatives.differentiate(x, order, 1.0, kind=kind, half_width=6) for x in (wave.real, wave.imag)]
+    parts = [
+        derivatives.differentiate(x, order, 1.0, kind=kind, half_width=6) for x in (wave.real, wave.imag)
+    ]
     gain = (parts[0] + 1j * parts[1])[150] / wave[150]
     expected = derivatives.response(kind, order, w, 6) * (1j if order % 2 else 1.0)
     assert abs(gain - expected) < 1e-11
