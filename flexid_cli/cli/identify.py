@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flexid_cli.cli.files import STDOUT, check_outputs
+from flexid_cli.cli.files import STDOUT, check_outputs, write_text_atomic
 from flexid_cli.cli.options import (
     Console,
     config_option,
@@ -31,13 +31,14 @@ if TYPE_CHECKING:
     from flexid_cli.report.document import InputFile
 
 NOTHING_IDENTIFIED = 3
+QUIETEST = -1  # with -qq the report stays out too
 
 
 @click.command(
     short_help="Estimate stiffness, inertias and friction from a log.",
     epilog=example(
         "flexid identify sample_logs/axis3.mcap --config configs/axis3.yaml",
-        "flexid identify sample_logs/axis3.bag -c configs/axis3.yaml -o report.md -o report.json",
+        "flexid identify sample_logs/axis3.bag -c configs/axis3.yaml -o report.md",
     ),
 )
 @click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="LOG...")
@@ -68,7 +69,8 @@ def identify(
 
     LOG is a CSV (also .gz, .zst), an MCAP, a rosbag2 folder or .db3, or a ROS 1 .bag; several LOGs are the files
     of one run. The report goes to the terminal, and with -o to .json and .md files (figures as SVG beside the
-    Markdown). Exit code 3: the data do not determine any parameter.
+    Markdown); -o - prints the JSON instead, and -qq prints no report. Exit code 3: the data do not determine any
+    parameter.
     """
     from flexid_cli.config.load import load_config
     from flexid_cli.report.write import check_formats
@@ -79,13 +81,13 @@ def identify(
         overrides = (*overrides, f"estimate.route={route}")
     loaded = load_config(config, overrides)
     identification, document = run_identify(logs, loaded, console)
-    _write(document, identification, outputs, force=force)
-    if as_json:
+    _write([path for path in outputs if path != STDOUT], document, identification, console, force=force)
+    if as_json or STDOUT in outputs:
         from flexid_cli.report.json import render_json
 
-        click.echo(render_json(document), nl=False)
-    else:
-        _show(document, console)
+        write_text_atomic(STDOUT, render_json(document))
+    elif console.verbosity >= QUIETEST:
+        _show(document)
     if not _anything_identified(identification):
         console.error(
             "no parameter could be identified from this recording",
@@ -105,6 +107,8 @@ def run_identify(
 
     recording, raw = build_recording(logs, config)
     console.detail(f"read {recording.samples} samples at {recording.sample_rate_hz:.6g} Hz from {raw.format}")
+    for step in recording.history:
+        console.detail(f"  {step}")
     identification = estimate(recording, config)
     document = build_document(
         identification=identification,
@@ -128,30 +132,37 @@ def _inputs(logs: Sequence[Path], raw: RawLog) -> list[InputFile]:
 
 
 def _write(
-    document: dict[str, Any], identification: Identification, outputs: Sequence[Path], *, force: bool
+    files: Sequence[Path],
+    document: dict[str, Any],
+    identification: Identification,
+    console: Console,
+    *,
+    force: bool,
 ) -> None:
-    from flexid_cli.report.json import render_json
     from flexid_cli.report.write import render_outputs
     from flexid_cli.writers.files import write_files
 
-    files = [path for path in outputs if path != STDOUT]
-    if files:
-        write_files(render_outputs(document, identification, files), force=force)
-    if len(files) < len(outputs):
-        click.echo(render_json(document), nl=False)
+    if not files:
+        return
+    contents = render_outputs(document, identification, files)
+    write_files(contents, force=force)
+    figures = len(contents) - len(files)
+    beside = f" and {figures} figures beside" if figures else ""
+    console.info(f"wrote {', '.join(str(path) for path in files)}{beside}")
 
 
-def _show(document: dict[str, Any], console: Console) -> None:
+def _show(document: dict[str, Any]) -> None:
     import sys
 
     from rich.console import Console as Terminal
 
     from flexid_cli.report.console import print_report
 
-    if console.verbosity < -1:
-        return
     terminal = Terminal(file=sys.stdout, no_color=wants_color() is False, highlight=False)
-    print_report(document, terminal)
+    # Captured, for rich itself would end the program with 1 where nobody reads the output any more.
+    with terminal.capture() as capture:
+        print_report(document, terminal)
+    click.echo(capture.get(), nl=False, color=True)
 
 
 def _anything_identified(identification: Identification) -> bool:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from flexid_cli.cli.files import check_outputs, write_text_atomic
+from flexid_cli.cli.files import STDOUT, check_outputs, write_text_atomic
 from flexid_cli.cli.options import (
     Console,
     example,
@@ -62,9 +62,8 @@ def inspect(
     if as_json:
         import json
 
-        click.echo(
-            json.dumps(as_document(inspection, proposal), indent=2, ensure_ascii=False, allow_nan=False)
-        )
+        text = json.dumps(as_document(inspection, proposal), indent=2, ensure_ascii=False, allow_nan=False)
+        write_text_atomic(STDOUT, text + "\n")
     elif config_file is None or str(config_file) != "-":
         click.echo(_render(inspection), color=wants_color(), nl=False)
         if config_file is None:

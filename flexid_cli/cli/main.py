@@ -10,6 +10,7 @@ import difflib
 import errno
 import importlib
 import os
+import signal
 import sys
 import warnings
 from contextlib import contextmanager, suppress
@@ -24,6 +25,7 @@ from flexid_cli.errors import ConfigError, FlexidError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from types import FrameType
 
     from click.shell_completion import CompletionItem
 
@@ -149,10 +151,12 @@ class LazyGroup(click.Group):
             return run(**extra)
         console = extra.pop("obj", None) or Console()
         _survive_narrow_encodings()
-        sys.exit(_guarded(lambda: run(obj=console, **extra), console))
+        with _watched_interrupts() as interrupts:
+            code = _guarded(lambda: run(obj=console, **extra), console, interrupts)
+        sys.exit(code)
 
 
-def _guarded(run: Callable[[], Any], console: Console) -> int:
+def _guarded(run: Callable[[], Any], console: Console, interrupts: Sequence[int] = ()) -> int:
     """Exit code of ``run``, with the message of whatever went wrong. A crash never gives 1."""
     try:
         with _silent_warnings():
@@ -174,8 +178,32 @@ def _guarded(run: Callable[[], Any], console: Console) -> int:
         console.error("not enough memory", "use a shorter record, or a machine with more memory")
         return EXIT_ERROR
     except Exception as error:  # noqa: BLE001 - the last resort of the whole program
+        if interrupts:
+            console.plain("interrupted")
+            return EXIT_INTERRUPTED
         return _tell_bug(error, console)
     return code if isinstance(code, int) else 0
+
+
+@contextmanager
+def _watched_interrupts() -> Iterator[list[int]]:
+    """Remember every Ctrl-C, for a library that it hits while it is imported turns it into an ImportError."""
+    seen: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        seen.append(number)
+        signal.default_int_handler(number, frame)
+
+    try:
+        own = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        previous = signal.signal(signal.SIGINT, interrupt) if own else None
+    except ValueError:  # not the main thread, which alone is interrupted
+        previous = None
+    try:
+        yield seen
+    finally:
+        if previous is not None:
+            signal.signal(signal.SIGINT, previous)
 
 
 def _tell_failure(error: FlexidError | click.ClickException, console: Console) -> int:

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from flexid_cli.errors import DataError
 from flexid_cli.estimate import budget
-from flexid_cli.estimate.fit import FitResult, block_matrices, fit
+from flexid_cli.estimate.fit import block_matrices, fit
 from flexid_cli.estimate.overdetermination import regression
 from flexid_cli.estimate.paper_route import PaperRegression
 from flexid_cli.models.motor_only import MotorOnly

@@ -19,12 +19,12 @@ from flexid_cli.pipeline.derivatives import differentiate
 from flexid_cli.signals.recording import Recording, Segment
 
 t, g = sp.symbols("t g", real=True)
-SYMBOLS = {name: sp.Symbol(name) for name in "Jm K JL FVm FV FSm FS MX MY c kg q0".split()}
+SYMBOLS = {name: sp.Symbol(name) for name in ["Jm", "K", "JL", "FVm", "FV", "FSm", "FS", "MX", "MY", "c", "kg", "q0"]}
 SYMBOLS["offset"] = sp.Symbol("offset")
 # Over a small motion the constant of the equation is the offset together with the gravity torque at q0.
 SYMBOLS["Q0"] = SYMBOLS["offset"]
 Jm, K, JL, FVm, FV, FSm, FS, MX, MY, c, kg, q0, offset = (
-    SYMBOLS[n] for n in "Jm K JL FVm FV FSm FS MX MY c kg q0 offset".split()
+    SYMBOLS[n] for n in ["Jm", "K", "JL", "FVm", "FV", "FSm", "FS", "MX", "MY", "c", "kg", "q0", "offset"]
 )
 q, qm, torque = (sp.Function(n)(t) for n in ("q", "qm", "torque"))
 # The friction signs and the gravity torque stay functions of time: all that the elimination needs is linear.
@@ -235,10 +235,10 @@ def test_table_3_follows_from_table_2_with_its_hidden_digits():
     Jm_, K_, JL_, FVm_, FV_, FSm_ = motor_only.paper_inversion(X)
     # X1 and X2 in six digits: FV is the difference X6 - FVm of numbers a dozen times larger.
     assert Jm_ == pytest.approx(172.1890, rel=2e-4)
-    assert K_ == pytest.approx(19552.6214, rel=2e-3)
-    assert JL_ == pytest.approx(40.3601, rel=2e-3)
+    assert pytest.approx(19552.6214, rel=2e-3) == K_
+    assert pytest.approx(40.3601, rel=2e-3) == JL_
     assert FVm_ == pytest.approx(1157.4716, rel=2e-4)
-    assert FV_ == pytest.approx(89.0974, rel=2e-3)
+    assert pytest.approx(89.0974, rel=2e-3) == FV_
     assert FSm_ == pytest.approx(5.1624)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from flexid_cli.config.load import load_config
-from flexid_cli.errors import FlexidError
 from flexid_cli.estimate.identify import identify
 from flexid_cli.signals.build import build_recording
 
@@ -65,12 +64,8 @@ def test_emps_pulses_is_the_same_machine(emps, parameter):
 
 @pytest.mark.parametrize("name", CONFIG_OF)
 def test_every_recording_gives_a_report_or_a_clear_word(root, recordings, name):
-    try:
-        result = _identify(root, recordings, name)
-    except FlexidError as error:
-        assert error.message
-        assert error.hint
-        return
+    # All of these can be read and judged; an error here would have to be a FlexidError with a cure, and a row above.
+    result = _identify(root, recordings, name)
     for model in result.models:
         for estimate in model.parameters:
             assert estimate.verdict == "identified" or estimate.reason, estimate.symbol
