@@ -222,8 +222,11 @@ class _Table:
         if text.strip().isdecimal() and 1 <= int(text) <= len(fields):
             return int(text) - 1
         if text.strip().isdecimal():
-            raise InputError(f"{self.path}: there is no column {text}, for it has {len(fields)} columns")
-        known = [one.text for one in fields] + [one.name for one in fields]
+            raise InputError(
+                f"{self.path}: there is no column {text}, for it has {len(fields)} columns",
+                f"columns are counted from 1; `flexid inspect {self.path}` lists them",
+            )
+        known = [one.name for one in fields]
         detail = "" if self.dialect.header else ", for it has no header"
         raise missing_channel(text, list(dict.fromkeys(known)), log=str(self.path), detail=detail)
 

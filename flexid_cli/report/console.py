@@ -120,6 +120,9 @@ def _lines(document: Mapping[str, Any], width: int) -> Iterator[_Line]:
         f"{recording['samples']} samples at {format_significant(recording['sample_rate_hz'], 6)} Hz, "
         f"{words.duration(recording['duration_s'])}"
     )
+    side = words.side_sentence(document)
+    if side:
+        yield _Line(side)
     for model in document["models"]:
         yield _Line("")
         yield from _model(model, width)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's palette, which people with any of the usual colour deficiencies can tell apart.
 _MEASURED = "#444444"
+_UNDERNEATH = "#AAAAAA"
 _PREDICTED = "#D55E00"
 _RESIDUAL = "#0072B2"
 _BAND = "#56B4E9"
@@ -69,7 +70,8 @@ def figure_torque(model: ModelResult) -> str:
     def draw(figure: Figure) -> None:
         trace = model.trace
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-        _line(upper, trace.time_s, trace.measured, color=_MEASURED, linewidth=1.6, label="measured")
+        # Wide and light, or a good prediction would hide it.
+        _line(upper, trace.time_s, trace.measured, color=_UNDERNEATH, linewidth=3.2, label="measured")
         _line(upper, trace.time_s, trace.predicted, color=_PREDICTED, linewidth=0.9, label="predicted")
         residual = trace.measured - trace.predicted
         _line(lower, trace.time_s, residual, color=_RESIDUAL, linewidth=0.9, label="residual")

@@ -52,7 +52,8 @@ def _verdict(document: Mapping[str, Any]) -> list[str]:
     if not lines:
         lines = ["No model was solved."]
     legend = "; ".join(f"*{words.VERDICTS[key]}*: {text}" for key, text in words.EXPLANATIONS.items())
-    return ["## Verdict", _bullets(lines), f"Here {legend}."]
+    side = words.side_sentence(document)
+    return ["## Verdict", _bullets(lines), f"Here {legend}.", *([escape(side)] if side else [])]
 
 
 def _results(model: Mapping[str, Any]) -> list[str]:
@@ -89,9 +90,16 @@ def _tests(model: Mapping[str, Any]) -> list[str]:
 
 
 def _facts(test: Mapping[str, Any]) -> str:
-    """Name and value of each entry of a test, nested ones left to the JSON."""
+    """Name and value of each entry of a test, what it means in brackets, nested ones left to the JSON."""
     simple = {key: value for key, value in test.items() if not isinstance(value, dict | list)}
-    return ", ".join(f"{_phrase(key)} {_value(key, value)}" for key, value in simple.items()) or MISSING
+    meaning = simple.pop("meaning", None)
+    facts = ", ".join(_fact(key, value) for key, value in simple.items()) or MISSING
+    return f"{facts} ({meaning})" if meaning else facts
+
+
+def _fact(key: str, value: object) -> str:
+    name, unit = (key[:-2], " s") if key.endswith("_s") and value is not None else (key, "")
+    return f"{_phrase(name)} {_value(key, value)}{unit}"
 
 
 def _phrase(key: str) -> str:

@@ -93,8 +93,25 @@ def estimate_cells(parameter: Mapping[str, Any], *, with_level: bool = False) ->
 
 
 def reasons(parameters: Iterable[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
-    """Name, verdict and reason of every parameter that has a reason."""
-    return [(human_name(p), VERDICTS[p["verdict"]], p["reason"]) for p in parameters if p["reason"]]
+    """Names, verdict and reason of the parameters that have a reason; those with the same one stand together."""
+    together: dict[tuple[str, str], list[str]] = {}
+    for p in parameters:
+        if p["reason"]:
+            together.setdefault((VERDICTS[p["verdict"]], p["reason"]), []).append(human_name(p))
+    return [(", ".join(names), verdict, reason) for (verdict, reason), names in together.items()]
+
+
+def side_sentence(document: Mapping[str, Any]) -> str:
+    """Say at which side of the gear the values count; empty where there is no gear."""
+    axis = document["config"]["resolved"].get("axis")
+    ratio = axis.get("gear_ratio", 1.0) if isinstance(axis, dict) else 1.0
+    if ratio == 1.0:
+        return ""
+    text = "Values are at the joint side"
+    if document["recording"]["torque_unit"] == "A":
+        return f"{text}, per ampere of motor current (gear ratio {format_significant(ratio)})."
+    gear = format_significant(ratio)
+    return f"{text}: torques {gear} times, inertias and stiffness {gear}² times those at the motor shaft."
 
 
 def quantity(unit: str) -> str:

@@ -29,7 +29,11 @@ def check_formats(outputs: Sequence[Path]) -> None:
     seen: set[Path] = set()
     for path in outputs:
         if path.suffix.lower() not in SUFFIXES:
-            why = f"the suffix {path.suffix!r} is that of no report" if path.suffix else "its name has no suffix"
+            why = (
+                f"the suffix {path.suffix!r} is that of no report"
+                if path.suffix
+                else "its name has no suffix"
+            )
             message = f"cannot write {path}: {why}"
             raise UsageError(message, "supported: " + ", ".join(SUFFIXES))
         if path.absolute() in seen:

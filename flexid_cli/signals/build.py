@@ -40,9 +40,10 @@ MIN_SEGMENT_SAMPLES = 32
 POSITIONS = ("motor_position", "joint_position", "reference_position")
 FASTEST_TURN = 1e4  # rad/s at the encoder; spindles end near it
 FASTEST_SLIDE = 100.0  # m/s
-MOTION_TOLERANCE = 0.02
-MOTION_BLOCKS = 200
+MOTION_TOLERANCE = 0.08
+MOTION_BLOCKS = (200, 60, 20)  # the longer the blocks, the less of a resonance is left in them
 FLEXIBLE = (0.5, 2.0)  # near a resonance the two sides do move differently far
+NEARLY_ONE = (0.85, 1.15)  # in slow motion they do not
 _TIME_NAME = re.compile(
     r"(?:\w*?[_. ])?(?:time|t|timestamp|time_?stamp|stamp|zeit|seconds?|secs?|epoch|clock)"
     r"(?:[_. ]?(?:s|sec|secs|seconds?|ms|msec|us|µs|usec|ns|nsec|nanos|millis|micros))?"
@@ -321,9 +322,15 @@ def _convert(role: str, track: Track, config: Config) -> Converted:
 
 
 def _require_motion(signal: _Signal) -> None:
+    """Refuse a channel from which nothing can be learnt; a reference may rest."""
     track = signal.track
     if track.name == "reference_position" or np.ptp(track.values) > 0.0:
         return
+    if track.values.size < MIN_SEGMENT_SAMPLES:
+        raise DataError(
+            f"{track.name}: the channel {signal.source!r} has only {track.values.size} samples",
+            f"record longer: at least {MIN_SEGMENT_SAMPLES} samples, and several seconds of motion",
+        )
     raise DataError(
         f"{track.name}: the channel {signal.source!r} never changes, it is {track.values[0]:g}"
         f" {signal.converted.unit} (joint side) in all {track.values.size} samples",
@@ -575,34 +582,47 @@ def _unit_notes(channels: Mapping[str, RawChannel], config: Config, time: RawCha
 
 def _check_motions(segments: Sequence[Segment], config: Config) -> list[str]:
     """Compare the two encoders' slow motion: a wrong side, gear, unit or sign shows as its ratio."""
-    pairs = [
-        (_slow(s.motor_position), _slow(s.joint_position)) for s in segments if s.joint_position is not None
-    ]
-    if not pairs:
+    if any(s.joint_position is None for s in segments):
         return []
-    motor, joint = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-    power = float(np.sqrt((motor @ motor) * (joint @ joint)))
-    if power == 0.0:
+    seen = [_compared(segments, blocks) for blocks in MOTION_BLOCKS]
+    correlation, ratio = max((pair for pair in seen if pair is not None), key=_size, default=(0.0, 1.0))
+    if correlation == 0.0:
         return []
-    correlation, ratio = float(motor @ joint) / power, float(np.sqrt((joint @ joint) / (motor @ motor)))
     if abs(correlation) < 0.5:
         words = f"motor_position and joint_position hardly move together (correlation {correlation:.2f})"
         return [f"{words}; are they of one axis?"]
-    ratio = ratio if correlation > 0 else -ratio
-    if FLEXIBLE[0] <= ratio <= FLEXIBLE[1] or abs(correlation) < 0.9:
+    low, high = NEARLY_ONE if correlation > 0.999 else FLEXIBLE
+    if low <= ratio <= high or abs(correlation) < 0.9:
         return []
-    cause = _cause_of(ratio, config) if abs(correlation) > 0.99 else None
-    text = f"at the joint side, joint_position moves {ratio:.5g} times as far as motor_position"
+    possible = ratio < FLEXIBLE[0] or ratio > FLEXIBLE[1]
+    cause = _cause_of(ratio, config) if possible and abs(correlation) > 0.99 else None
+    text = f"at the joint side, joint_position moves {ratio:.3g} times as far as motor_position"
     if cause is not None:
         raise InputError(f"{text}; {cause[0]}", cause[1])
     return [f"{text}; are gear_ratio, side, unit and sign right?"]
 
 
-def _slow(position: Array | None) -> Array:
-    """Means of up to 200 blocks, about their mean: what vibrates near a resonance averages out."""
+def _size(pair: tuple[float, float]) -> float:
+    """Size of the correlation, the first of the pair."""
+    return abs(pair[0])
+
+
+def _compared(segments: Sequence[Segment], blocks: int) -> tuple[float, float] | None:
+    """Correlation and signed ratio of the encoders' motions; None where one of them rests."""
+    motor = np.concatenate([_slow(s.motor_position, blocks) for s in segments])
+    joint = np.concatenate([_slow(s.joint_position, blocks) for s in segments])
+    power = float(np.sqrt((motor @ motor) * (joint @ joint)))
+    if power == 0.0:
+        return None
+    correlation = float(motor @ joint) / power
+    return correlation, float(np.copysign(np.sqrt((joint @ joint) / (motor @ motor)), correlation))
+
+
+def _slow(position: Array | None, blocks: int) -> Array:
+    """Means of ``blocks`` blocks, about their mean: what vibrates near a resonance averages out."""
     if position is None:
         return np.zeros(0)
-    block = max(1, position.size // MOTION_BLOCKS)
+    block = max(1, position.size // blocks)
     count = position.size // block
     means = position[: count * block].reshape(count, block).mean(axis=1)
     return np.asarray(means - means.mean())
@@ -623,8 +643,8 @@ def _cause_of(ratio: float, config: Config) -> tuple[str, str] | None:
     for factor, words in turns:
         factors.append((factor, f"that is the factor {words}", "is one of the units wrong?"))
         factors.append((1.0 / factor, f"that is one over the factor {words}", "is one of the units wrong?"))
-    for factor, cause, cure in factors:
-        if abs(abs(ratio) / factor - 1.0) <= MOTION_TOLERANCE:
-            turn = "set `sign: -1` on one of the two" if ratio < 0 else ""
-            return cause, "; ".join(part for part in (cure, turn) if part)
-    return None
+    off, cause, cure = min((abs(np.log(abs(ratio) / factor)), *words) for factor, *words in factors)
+    if off > MOTION_TOLERANCE:
+        return None
+    turn = "set `sign: -1` on one of the two" if ratio < 0 else ""
+    return cause, "; ".join(part for part in (cure, turn) if part)

@@ -440,7 +440,7 @@ def make_track(
     distinct = np.concatenate(([True], np.diff(stamps) > 0)) if stamps.size else np.zeros(0, dtype=np.bool_)
     stamps, kept = stamps[distinct], ordered[distinct]
     if stamps.size < 2:
-        raise InputError(_too_few(name, source, values, stamps.size), "check the source, or the recording")
+        raise _too_few(name, source, values, int(np.count_nonzero(finite)))
     steps = np.diff(stamps)
     limit = _gap_limit(steps, max_gap_s)
     period = mean_period(steps, limit)
@@ -458,13 +458,20 @@ def make_track(
     )  # fmt: skip
 
 
-def _too_few(name: str, source: str, values: Array, left: int) -> str:
-    if values.size == left == 1:
-        return f"{name}: the channel {source!r} has only one sample"
-    if values.size == 0:
-        return f"{name}: the channel {source!r} has no sample"
-    usable = "no usable sample" if left == 0 else "only one usable sample"
-    return f"{name}: the channel {source!r} has {usable} among {values.size} (numbers with distinct stamps)"
+def _too_few(name: str, source: str, values: Array, usable: int) -> InputError:
+    """Return the error for a channel of which less than two samples are left."""
+    total = values.size
+    if total > 1 and usable > 1:
+        text = f"{name}: all {usable} samples of the channel {source!r} have the same stamp"
+        return InputError(text, "choose another clock in signals.time.source, or give signals.time.rate_hz")
+    if total < 2:
+        count = "only one sample" if total else "no sample"
+    elif np.isfinite(values).any():
+        count = f"only {usable} of {total} samples with a number and a stamp"
+    else:
+        count = f"no number among its {total} samples"
+    hint = f"check signals.{name}.source, or record again"
+    return InputError(f"{name}: the channel {source!r} has {count}", hint)
 
 
 def _statistics(

@@ -19,7 +19,9 @@ from flexid_cli.pipeline.derivatives import differentiate
 from flexid_cli.signals.recording import Recording, Segment
 
 t, g = sp.symbols("t g", real=True)
-SYMBOLS = {name: sp.Symbol(name) for name in ["Jm", "K", "JL", "FVm", "FV", "FSm", "FS", "MX", "MY", "c", "kg", "q0"]}
+SYMBOLS = {
+    name: sp.Symbol(name) for name in ["Jm", "K", "JL", "FVm", "FV", "FSm", "FS", "MX", "MY", "c", "kg", "q0"]
+}
 SYMBOLS["offset"] = sp.Symbol("offset")
 # Over a small motion the constant of the equation is the offset together with the gravity torque at q0.
 SYMBOLS["Q0"] = SYMBOLS["offset"]
@@ -30,17 +32,17 @@ q, qm, torque = (sp.Function(n)(t) for n in ("q", "qm", "torque"))
 # The friction signs and the gravity torque stay functions of time: all that the elimination needs is linear.
 sign_motor, sign_joint, gravity_torque = (sp.Function(n)(t) for n in ("S", "SL", "Q"))
 
-PAPER_TRUTH = dict(
-    Jm=174.7996,
-    K=20341.0458,
-    JL=47.4458,
-    FVm=235.91,
-    FSm=41.4254,
-    FV=83.1508,
-    FS=8.4612,
-    MX=-0.7241,
-    MY=-53.4201,
-)
+PAPER_TRUTH = {
+    "Jm": 174.7996,
+    "K": 20341.0458,
+    "JL": 47.4458,
+    "FVm": 235.91,
+    "FSm": 41.4254,
+    "FV": 83.1508,
+    "FS": 8.4612,
+    "MX": -0.7241,
+    "MY": -53.4201,
+}
 GRAVITY = 9.81
 REGRESSION_THETA = np.array([PAPER_TRUTH[n] for n in ("Jm", "K", "JL", "FVm", "FV", "FSm")])
 
