@@ -15,14 +15,12 @@ from flexid_cli.cli.options import (
     json_option,
     pass_console,
     verbosity_options,
-    wants_color,
 )
 
 if TYPE_CHECKING:
     from flexid_cli.signals.inspect import ChannelSummary, Inspection
 
 PIPE_WIDTH = 80
-NAME_WIDTH = 12
 COLUMNS = ("samples", "rate Hz", "jitter %", "gaps", "min", "max", "unit")
 
 
@@ -65,7 +63,7 @@ def inspect(
         text = json.dumps(as_document(inspection, proposal), indent=2, ensure_ascii=False, allow_nan=False)
         write_text_atomic(STDOUT, text + "\n")
     elif config_file is None or str(config_file) != "-":
-        click.echo(_render(inspection), color=wants_color(), nl=False)
+        click.echo(_render(inspection), nl=False)
         if config_file is None:
             click.echo("\nProposed configuration (--write-config FILE writes it):\n")
             click.echo(proposal, nl=False)
@@ -77,32 +75,28 @@ def inspect(
 
 
 def _render(inspection: Inspection) -> str:
-    """Return the table as text: as wide as the terminal or 80 columns, wider where numbers need it."""
+    """Return the table as text; where a name leaves no room for the numbers, they stand below it."""
+    rows = [
+        ("channel", COLUMNS),
+        *((channel.info.source, _cells(channel)) for channel in inspection.channels),
+    ]
+    widths = [max(len(cells[n]) for _, cells in rows) for n in range(len(COLUMNS))]
+    name_width = max(len(name) for name, _ in rows)
+    fits = name_width + sum(widths) + 2 * len(widths) <= _terminal_width()
+    lines = [_summary_line(inspection)]
+    for name, cells in rows:
+        numbers = "  ".join(map(str.rjust, cells[:-1], widths))
+        text = f"{numbers}  {cells[-1]}"
+        lines += [f"{name:<{name_width}}  {text}"] if fits else [name, f"  {text}"]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _terminal_width() -> int:
+    """Columns of the terminal; 80 for a pipe."""
+    import shutil
     import sys
 
-    from rich.console import Console as RichConsole
-    from rich.table import Table
-    from rich.text import Text
-
-    rows = [(channel.info.source, _cells(channel)) for channel in inspection.channels]
-    widths = [max(len(title), *(len(cells[n]) for _, cells in rows)) for n, title in enumerate(COLUMNS)]
-    needed = sum(widths) + 2 * len(widths) + NAME_WIDTH
-    terminal = sys.stdout.isatty()
-    own = RichConsole().width if terminal else PIPE_WIDTH
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column("channel", overflow="fold", min_width=NAME_WIDTH)
-    for title, width in zip(COLUMNS, widths, strict=True):
-        justify = "left" if title == "unit" else "right"
-        table.add_column(title, justify=justify, no_wrap=True, min_width=width)  # type: ignore[arg-type]
-    for source, cells in rows:
-        table.add_row(Text(source), *(Text(cell) for cell in cells))
-    rich = RichConsole(
-        width=max(own, needed), force_terminal=terminal, no_color=wants_color() is False, highlight=False
-    )
-    with rich.capture() as capture:
-        rich.print(Text(_summary_line(inspection)), soft_wrap=True)
-        rich.print(table)
-    return "\n".join(line.rstrip() for line in capture.get().splitlines()) + "\n"
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else PIPE_WIDTH
 
 
 def _summary_line(inspection: Inspection) -> str:

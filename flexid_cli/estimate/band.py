@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.errors import DataError
+from flexid_cli.estimate.covariance import robust_covariance
 from flexid_cli.estimate.least_squares import solve
 from flexid_cli.models.two_encoders import TwoEncoders
 from flexid_cli.pipeline.chain import MIN_ROWS, Chain, ChainSettings
@@ -36,6 +37,9 @@ SIGN_BAND = 8.0
 SCAN_STEP = 1.25
 SCAN_RANGE = (0.5, 0.95)
 SCAN_MAX_RELATIVE_STDERR = 0.1
+# A band shows a resonance only where the load inertia behind the spring, X5 - X3/X1, stands out of its noise: five
+# standard errors, for some twenty bands are looked at.
+CLEAR_LOAD = 5.0
 LOWPASS_ORDER = {"two_encoders": 4, "motor_only": 6, "rigid": 4}
 HIGHEST_DERIVATIVE = {"two_encoders": 2, "motor_only": 4, "rigid": 2}
 MAX_BAND_OVER_RATE = 0.2
@@ -188,7 +192,8 @@ def find_resonance(recording: Recording, gravity_m_per_s2: float) -> float | Non
     longest = max(s.samples for s in recording.segments) / rate
     band = max(4.0 * MIN_ROWS / longest, 0.2)
     best: tuple[float, float] | None = None
-    while band <= MAX_BAND_OVER_RATE * rate:
+    highest = min(MAX_BAND_OVER_RATE * rate, usable_band(recording, joint=recording.has_joint_position))
+    while band <= highest:
         found = _resonance_at(recording, band, solver, gravity_m_per_s2)
         if found is not None:
             resonance, uncertainty = found
@@ -228,10 +233,16 @@ def _resonance_motor(columns: Columns) -> tuple[float, float] | None:
     names += [("sign_motor", 0), ("one", 0), ("motor", 0)]
     W = np.column_stack([s * columns(*c) for s, c in zip(signs, names, strict=True)])
     result = solve(W, columns("torque", 0))
-    X1, X3, X5 = result.estimate[[0, 2, 4]]
+    robust = robust_covariance(W * result.residuals[:, None], result.bread, columns.lengths)
+    index = [0, 2, 4]
+    X1, X3, X5 = (float(x) for x in result.estimate[index])
     if not (X1 > 0.0 and X3 > 0.0 and X5 > X3 / X1):
         return None
-    relative = result.stderr[[0, 2, 4]] / result.estimate[[0, 2, 4]]
+    covariance = robust.covariance[np.ix_(index, index)]
+    gradient = np.array([X3 / X1**2, -1.0 / X1, 1.0])
+    if CLEAR_LOAD * float(np.sqrt(gradient @ covariance @ gradient)) > X5 - X3 / X1:
+        return None
+    relative = np.sqrt(np.diag(covariance)) / np.array([X1, X3, X5])
     return float(np.sqrt(X5 / X3) / (2.0 * np.pi)), float(np.max(relative))
 
 

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 NOISE_BAND = (0.6, 0.95)
 NOISE_SEED = 20010521
 SIGN_BAND_STEP = 0.7
+MAX_NOISE_SHARE = 0.9
 _NOISY_SIGNALS = frozenset({"torque", "motor", "joint", "torsion"})
 
 
@@ -82,22 +83,37 @@ def noise_bias(model: Model, result: FitResult, columns: Columns, levels: NoiseL
     """Shift of the estimates by noise in the columns (errors in variables), to second order in the noise.
 
     A synthetic record of the signals' noise alone passes the same chain; its columns V add V'V to the normal
-    matrix, which moves the minimum by -H^-1 sum_k w_k^2 D_k' V_k' V_k a_k.
+    matrix, which moves the minimum by -(H - N)^-1 sum_k w_k^2 D_k' V_k' V_k a_k, N the noise's part of H.
 
     Returns
     -------
     ndarray, shape (p,)
     """
     noise = _noise_columns(columns, levels)
-    gradient = np.zeros(result.theta.size)
+    size = result.theta.size
+    gradient, curvature = np.zeros(size), np.zeros((size, size))
     coefficients = model.coefficients(result.theta)
     derivatives = model.jacobian(result.theta)
     for block, w, a, D in zip(model.blocks, result.weights, coefficients, derivatives, strict=True):
-        V = _block_noise(block, noise)
-        gradient += w**2 * (V @ D).T @ (V @ a)
-    # (V D)'(V a) also holds the noise of the left side against itself, which is no error in variables only if
-    # the coefficient does not depend on the parameters: D is zero there, so nothing has to be taken out.
-    return -_solve_normal(result, gradient)
+        V = w * _block_noise(block, noise)
+        gradient += (V @ D).T @ (V @ a)
+        curvature += (V @ D).T @ (V @ D)
+    return -_solve_without(result, curvature, gradient)
+
+
+def _solve_without(result: FitResult, curvature: Array, right: Array) -> Array:
+    """(J'J - curvature)^-1 right: the normal matrix that the signals have without their noise.
+
+    In the eigenvectors of the noise's share of J'J; the share is cut at MAX_NOISE_SHARE, for a direction that is
+    nearly all noise has no bias that could be named.
+    """
+    scale = np.linalg.norm(result.jacobian, axis=0)
+    scale[scale == 0.0] = 1.0
+    _, s, Vt = np.linalg.svd(result.jacobian / scale, full_matrices=False)
+    root = Vt[: result.rank].T / s[: result.rank]
+    share, U = np.linalg.eigh(root.T @ (curvature / np.outer(scale, scale)) @ root)
+    inside = U.T @ (root.T @ (right / scale)) / (1.0 - np.clip(share, 0.0, MAX_NOISE_SHARE))
+    return np.asarray(root @ (U @ inside) / scale, dtype=np.float64)
 
 
 def limited_torque_noise(
@@ -119,13 +135,10 @@ def _noise_columns(columns: Columns, levels: NoiseLevels) -> Columns:
 
     def noisy(segment: Segment) -> Segment:
         n = segment.samples
+        torque = levels.torque * rng.standard_normal(n)
+        motor = levels.motor_position * rng.standard_normal(n)
         joint = levels.joint_position * rng.standard_normal(n) if segment.joint_position is not None else None
-        return replace(
-            segment,
-            torque=levels.torque * rng.standard_normal(n),
-            motor_position=levels.motor_position * rng.standard_normal(n),
-            joint_position=joint,
-        )
+        return replace(segment, torque=torque, motor_position=motor, joint_position=joint)
 
     record = replace(columns.recording, segments=tuple(noisy(s) for s in columns.segments))
     return Columns(record, columns.chain, columns.velocities.cutoff_hz, columns.gravity)
@@ -166,6 +179,15 @@ def torque_hold(model: Model, result: FitResult, columns: Columns) -> Array:
         gradients.append(gradient)
     column = np.concatenate([w * g for w, g in zip(result.weights, gradients, strict=True)])
     return -_solve_normal(result, result.jacobian.T @ column)
+
+
+def left_out_flexibility(result: FitResult, columns: Columns) -> Nuisance:
+    """JL^2/K that the rigid model leaves out, and what it would do to the parameters.
+
+    To first order a spring makes the inertia at frequency w larger by JL^2/K w^2: the column of the fourth
+    derivative is missing.
+    """
+    return _nuisance(result, [columns("motor", 4)], columns.lengths)
 
 
 def reversal_width(

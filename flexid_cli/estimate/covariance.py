@@ -101,9 +101,14 @@ def _degrees_of_freedom(parts: Sequence[tuple[Array, Array]]) -> Array:
     trace, square = np.zeros(parameters), np.zeros(parameters)
     for cosines, part in parts:
         rows, count = cosines.shape
+        variance = np.column_stack([_smooth(x**2, count) for x in part.T])
+        # cos j cos k = (cos (j-k) + cos (j+k)) / 2: M follows from 2 B + 1 sums.
+        angle = np.pi * (np.arange(rows) + 0.5) / rows
+        sums = np.cos(np.outer(np.arange(2 * count + 1), angle)) @ variance / count
+        j = np.arange(1, count + 1)
+        difference, total = np.abs(j[:, None] - j), j[:, None] + j
         for k in range(parameters):
-            variance = _smooth(part[:, k] ** 2, count) * rows
-            M = cosines.T @ (cosines * variance[:, None]) / count
+            M = sums[difference, k] + sums[total, k]
             trace[k] += np.trace(M)
             square[k] += np.sum(M**2)
     return np.asarray(np.maximum(trace**2 / np.maximum(square, np.finfo(float).tiny), 1.0), dtype=np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from flexid_cli.errors import DataError
 from flexid_cli.estimate import band, budget, paper_route, summary
-from flexid_cli.estimate.fit import block_matrices, block_matrix, fit
+from flexid_cli.estimate.fit import FitResult, block_matrices, block_matrix, fit
 from flexid_cli.estimate.least_squares import solve, triangle
 from flexid_cli.estimate.result import Identification, ModelResult, Skipped
 from flexid_cli.estimate.reversal import fit_reversal_velocity
@@ -31,8 +32,11 @@ Array = NDArray[np.float64]
 # Over a smaller motion cos q and sin q are a constant and a slope to 1.5 % of the gravity moment.
 SMALL_MOTION_RAD = 0.35
 MAX_REBUILDS = 8
+SETTLED = 1e-6
 RETUNE_TOLERANCE = 0.15
 RIGID_BIAS_OVER_STDERR = 0.3
+# A spring is passive: only a clearly positive JL^2/K is one, and worth a narrower band.
+CLEAR_FLEXIBILITY = 3.0
 
 
 def identify(recording: Recording, config: Config) -> Identification:
@@ -162,29 +166,36 @@ def _regress(M: Array) -> Array:
 
 
 def _motor_only(recording: Recording, config: Config, f1: float | None) -> Solution:
+    recording = _without_joint(recording)
     tuning = band.choose_tuning(recording, config, "motor_only", f1)
     columns = make_columns(recording, config, tuning)
     model = MotorOnly(gravity_form(recording))
-    linear = [c for c in model.blocks[0].columns if c != ("sign_joint", 0)]
+    start = _motor_start(columns, model)
 
     def cost() -> float:
-        return _log_residual(columns, linear)
+        # The linear fit's free coefficients would hide a wrong width: only the physical ones feel it.
+        return float(np.log(_motor_fit(columns, model, start, "iid", rebuilds=2)[1].sigmas[0]))
 
     columns.set_reversal_velocity(fit_reversal_velocity(columns, cost))
-    theta = _motor_start(columns, model)
-    for _ in range(MAX_REBUILDS):
+    matrices, result = _motor_fit(columns, model, start, config.estimate.covariance, rebuilds=MAX_REBUILDS)
+    reason = "direct fit of the physical parameters to the exact equation (18), all terms kept"
+    return Solution(model, columns, matrices, result, tuning, "structured", reason)
+
+
+def _motor_fit(
+    columns: Columns, model: MotorOnly, theta: Array, covariance: str, *, rebuilds: int
+) -> tuple[tuple[Array, ...], FitResult]:
+    """Fit, rebuild the joint's motion from the parameters, and fit again until they settle."""
+    for _ in range(rebuilds):
         Jm, K, _, FVm, _, FSm = theta[:6]
         columns.rebuild_joint(Jm, FVm, FSm, K)
         matrices = block_matrices(model, columns)
-        result = fit(
-            model, matrices, theta, columns.lengths, weighted=False, covariance=config.estimate.covariance
-        )
+        result = fit(model, matrices, theta, columns.lengths, weighted=False, covariance=covariance)
         moved = np.max(np.abs(result.theta[:3] / theta[:3] - 1.0))
         theta = result.theta
-        if moved < 1e-6:
+        if moved < SETTLED:
             break
-    reason = "direct fit of the physical parameters to the exact equation (18), all terms kept"
-    return Solution(model, columns, matrices, result, tuning, "structured", reason)
+    return matrices, result
 
 
 def _log_residual(columns: Columns, names: Sequence[tuple[str, int]]) -> float:
@@ -212,6 +223,7 @@ def _motor_start(columns: Columns, model: MotorOnly) -> Array:
 
 
 def _rigid(recording: Recording, config: Config, f1: float | None) -> Solution:
+    recording = _without_joint(recording)
     tuning = band.choose_tuning(recording, config, "rigid", f1)
     fixed = config.pipeline.band_hz is not None or config.pipeline.decimation is not None
     levels = budget.noise_levels(recording)
@@ -228,12 +240,21 @@ def _rigid(recording: Recording, config: Config, f1: float | None) -> Solution:
         result = fit(
             model, matrices, start, columns.lengths, weighted=False, covariance=config.estimate.covariance
         )
-        bias = budget.noise_bias(model, result, columns, levels)
+        bias = abs(budget.noise_bias(model, result, columns, levels)[0])
+        flexibility = budget.left_out_flexibility(result, columns)
+        if flexibility.value > CLEAR_FLEXIBILITY * flexibility.stderr:
+            bias = max(bias, abs(flexibility.per_unit[0] * flexibility.value))
         narrower = band.narrower(tuning, config, recording)
-        if fixed or narrower is None or abs(bias[0]) < RIGID_BIAS_OVER_STDERR * result.stderr[0]:
+        if fixed or narrower is None or bias < RIGID_BIAS_OVER_STDERR * result.stderr[0]:
             break
         tuning = narrower
     return Solution(model, columns, matrices, result, tuning, "ols", "one equation, linear in its parameters")
+
+
+def _without_joint(recording: Recording) -> Recording:
+    """The recording as a drive without joint encoder would have it."""
+    segments = tuple(replace(segment, joint_position=None) for segment in recording.segments)
+    return replace(recording, segments=segments)
 
 
 def gravity_form(recording: Recording) -> str:

@@ -72,6 +72,7 @@ def _wald(solution: Solution, free: Array, covariance: Array, series: int) -> di
     scaled = statistic / restrictions * remaining / series
     return {
         "statistic": statistic,
+        "scaled_statistic": scaled,
         "restrictions": restrictions,
         "p_value": float(f_distribution.sf(scaled, restrictions, remaining)),
         "meaning": "a small p value: distortion, noise in the columns or missing physics bias the coefficients",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flexid_cli.errors import DataError
 from flexid_cli.estimate import budget, overdetermination
 from flexid_cli.estimate.result import Estimate, Fit, ModelResult, PipelineSummary, Spectrum, Trace
 from flexid_cli.estimate.solution import Solution
@@ -61,17 +62,18 @@ class Uncertainty:
 
 def summarise(solution: Solution, config: Config, *, regression: bool = True) -> ModelResult:
     """Parameters with intervals and verdicts, derived quantities, fit, tests and figures' data."""
-    uncertainty = total_uncertainty(solution, config)
+    free: tuple[Estimate, ...] = ()
+    tests: dict[str, dict[str, Any]] = {}
+    misfit = 1.0
+    if regression and solution.model.id == "motor_only":
+        free, tests["over_determination"] = _free_regression(solution, config)
+        misfit = max(1.0, tests["over_determination"].get("scaled_statistic") or 1.0)
+    uncertainty = total_uncertainty(solution, config, misfit)
     parameters, theta, covariance = _reported(solution.model, solution.result.theta, uncertainty.covariance)
     estimates = _estimates(solution, config, uncertainty, parameters, theta, covariance)
     fitted = _fit(solution)
     doubt = model_doubt(estimates, fitted.fit_percent)
-    tests: dict[str, dict[str, Any]] = {"torque_delay": _delay_test(uncertainty.delay, solution)}
-    free: tuple[Estimate, ...] = ()
-    if regression and solution.model.id == "motor_only":
-        free, tests["over_determination"] = overdetermination.regression(
-            solution, config, make=lambda p, v, s, d: _judge(solution, config, p, v, s, d)
-        )
+    tests["torque_delay"] = _delay_test(uncertainty.delay, solution)
     effects = dict.fromkeys(p.effect for p in parameters if p.effect)
     return ModelResult(
         id=solution.model.id,
@@ -96,8 +98,22 @@ def summarise(solution: Solution, config: Config, *, regression: bool = True) ->
     )
 
 
-def total_uncertainty(solution: Solution, config: Config) -> Uncertainty:
-    """Random and systematic part of the estimates' uncertainty."""
+def _free_regression(solution: Solution, config: Config) -> tuple[tuple[Estimate, ...], dict[str, Any]]:
+    """X1..X7 without restrictions and the test of these, or why there are none."""
+    try:
+        return overdetermination.regression(
+            solution, config, make=lambda p, v, s, d: _judge(solution, config, p, v, s, d)
+        )
+    except DataError as error:
+        return (), {"statistic": None, "p_value": None, "reason": error.message}
+
+
+def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -> Uncertainty:
+    """Random and systematic part of the estimates' uncertainty.
+
+    ``misfit`` multiplies the random covariance (Birge, Phys. Rev. 40 (1932) 207): the free coefficients contradict
+    each other by more than the residuals explain, so whatever does that is taken to act on the parameters too.
+    """
     model, result, columns = solution.model, solution.result, solution.columns
     lengths = columns.lengths
     delay = budget.torque_delay(model, result, columns, lengths)
@@ -116,8 +132,12 @@ def total_uncertainty(solution: Solution, config: Config) -> Uncertainty:
         if width is not None:
             shifts["the width of the friction reversal"] = width.shift(at_most=1.0)
         shifts["the band of the friction's velocity"] = budget.sign_band(model, result, columns)
-    covariance = result.covariance + sum(np.outer(s, s) for s in shifts.values())
-    random = np.maximum(np.diag(result.covariance), np.finfo(float).tiny)
+        if model.id == "rigid":
+            flexibility = budget.left_out_flexibility(result, columns)
+            shifts["flexibility, which the rigid model leaves out"] = flexibility.shift(at_most=0.0)
+    random_part = misfit * result.covariance
+    covariance = random_part + sum(np.outer(s, s) for s in shifts.values())
+    random = np.maximum(np.diag(random_part), np.finfo(float).tiny)
     share = np.diag(covariance) / random
     dof = np.minimum(result.degrees_of_freedom * share**2, 1e6)
     largest = []
@@ -219,6 +239,8 @@ def _derived(solution: Solution, config: Config, uncertainty: Uncertainty) -> tu
     if "K" not in symbols:
         return ()
     index = [symbols.index(s) for s in ("Jm", "K", "JL")]
+    if set(index) & set(solution.result.dependent):
+        return ()
     Jm, K, JL = (float(x) for x in solution.result.theta[index])
     covariance = uncertainty.covariance[np.ix_(index, index)]
     dof = float(np.min(uncertainty.degrees_of_freedom[index]))

@@ -83,6 +83,9 @@ def _verdict(
         return "not_identifiable", f"relative standard deviation {relative:.0f} %" + because
     if relative > IDENTIFIED_PERCENT:
         return "weak", f"relative standard deviation {relative:.0f} %" + because
+    half = 0.5 * (interval.high - interval.low)
+    if 100.0 * half > WEAK_PERCENT * abs(value):
+        return "weak", "a short part of the record carries it, so its interval is wide" + because
     return "identified", ""
 
 

@@ -48,8 +48,8 @@ class ChainSettings:
 class Chain:
     """Low pass, derivative, parallel decimation, trim: a linear operator, the same for every column.
 
-    The decimation filter starts at rest on all columns, so that a linear relation between unfiltered columns
-    holds exactly between filtered ones, edges included; only the reach of the derivative is lost.
+    The decimation filter starts at rest on all columns, so that a linear relation between what enters it holds
+    exactly between the rows; what the derivative cannot reach and the low pass has not settled on does not enter.
     """
 
     settings: ChainSettings
@@ -71,6 +71,17 @@ class Chain:
         if self.settings.derivative == "central":
             return 1
         return derivatives.half_width_for(min(self.band_hz / self.settings.sample_rate_hz, 0.4))
+
+    @cached_property
+    def _reach(self) -> int:
+        """Samples at each end that the derivative cannot reach or the low pass has not settled on.
+
+        The low pass extends the signal beyond its ends, which does not commute with the derivative: these samples
+        must be gone before the decimation filter spreads them.
+        """
+        settling = 0 if self._lowpass is None else filters.settling_samples(self._lowpass)
+        kind = self.settings.derivative
+        return derivatives.reach(kind, derivatives.MAX_ORDER, self.half_width) + settling
 
     @property
     def band_hz(self) -> float:
@@ -111,8 +122,7 @@ class Chain:
         return max(0, len(range(*self._kept(samples))))
 
     def _kept(self, samples: int) -> tuple[int, int, int]:
-        reach = derivatives.reach(self.settings.derivative, derivatives.MAX_ORDER, self.half_width)
-        margin = reach + self.trim_samples(samples)
+        margin = self._reach + self.trim_samples(samples)
         return margin, samples - margin, self.settings.decimation
 
     def row_times(self, samples: int, start_s: float) -> Array:
@@ -146,7 +156,7 @@ class Chain:
             )
         if self._lowpass is not None:
             x = filters.zero_phase(x, self._lowpass)
-        reach = derivatives.reach(self.settings.derivative, derivatives.MAX_ORDER, self.half_width)
+        reach = self._reach
         column = derivatives.differentiate(
             x,
             derivative,

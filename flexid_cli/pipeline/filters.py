@@ -64,7 +64,7 @@ def zero_phase(x: Array, sos: Array, *, settled_edges: bool = True) -> Array:
     from scipy.signal import sosfilt, sosfiltfilt
 
     if settled_edges:
-        padding = min(_settling_samples(sos), x.size - 1)
+        padding = min(settling_samples(sos), x.size - 1)
         return np.asarray(sosfiltfilt(sos, x, padtype="odd", padlen=padding), dtype=np.float64)
     forward = sosfilt(sos, x)
     return np.asarray(sosfilt(sos, forward[::-1])[::-1], dtype=np.float64)
@@ -78,7 +78,7 @@ def magnitude(sos: Array, frequency_hz: Array, sample_rate_hz: float) -> Array:
     return np.asarray(np.abs(response) ** 2, dtype=np.float64)
 
 
-def _settling_samples(sos: Array, remaining: float = 1e-3) -> int:
+def settling_samples(sos: Array, remaining: float = 1e-3) -> int:
     """Samples until the slowest pole has decayed to ``remaining``."""
     a1, a2 = sos[:, 4], sos[:, 5]
     spread = a1**2 - 4.0 * a2

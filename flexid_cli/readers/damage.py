@@ -59,4 +59,6 @@ def unreadable(path: Path, error: OSError) -> InputError:
     """Return the error for a file that the system does not give out, or that a codec refuses."""
     if error.strerror is None:
         return damaged(path, explain(error))
-    return InputError(f"cannot read {path}: {error.strerror.lower()}")
+    return InputError(
+        f"cannot read {path}: {error.strerror.lower()}", "check its permissions, or copy it first"
+    )

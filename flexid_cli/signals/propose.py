@@ -158,8 +158,17 @@ def _kind_of(candidate: _Candidate) -> str | None:
     kinds = (("current", _CURRENT), ("torque", _TORQUE), ("voltage", _VOLTAGE), ("position", _POSITION))
     for kind, words in kinds:
         if candidate.words & words:
-            return kind
+            return kind if kind == "position" else _declared_kind(candidate) or kind
     return "position" if candidate.words & _NOT_MEASURED and not candidate.words & {"pulses"} else None
+
+
+def _declared_kind(candidate: _Candidate) -> str | None:
+    """Kind of torque signal by the declared unit, for many drives put the current where JointState has effort."""
+    try:
+        dimension = parse_unit(candidate.channel.info.unit or "").dimension
+    except UsageError:
+        return None
+    return {"current": "current", "torque": "torque", "force": "torque", "voltage": "voltage"}.get(dimension)
 
 
 def _guess_torque(

@@ -434,13 +434,13 @@ def make_track(
     InputError
         Less than two samples are left.
     """
-    ordered = values[timeline.order]
-    finite = np.isfinite(ordered)
-    stamps, ordered = timeline.stamps[finite], ordered[finite]
+    timed = values[timeline.order]
+    finite = np.isfinite(timed)
+    stamps, ordered = timeline.stamps[finite], timed[finite]
     distinct = np.concatenate(([True], np.diff(stamps) > 0)) if stamps.size else np.zeros(0, dtype=np.bool_)
     stamps, kept = stamps[distinct], ordered[distinct]
     if stamps.size < 2:
-        raise _too_few(name, source, values, int(np.count_nonzero(finite)))
+        raise _too_few(name, source, values, timed=timed.size, usable=int(np.count_nonzero(finite)))
     steps = np.diff(stamps)
     limit = _gap_limit(steps, max_gap_s)
     period = mean_period(steps, limit)
@@ -458,20 +458,21 @@ def make_track(
     )  # fmt: skip
 
 
-def _too_few(name: str, source: str, values: Array, usable: int) -> InputError:
+def _too_few(name: str, source: str, values: Array, *, timed: int, usable: int) -> InputError:
     """Return the error for a channel of which less than two samples are left."""
-    total = values.size
+    total, channel = values.size, f"{name}: the channel {source!r}"
+    cure = "choose another clock in signals.time.source, or give signals.time.rate_hz"
     if total > 1 and usable > 1:
         text = f"{name}: all {usable} samples of the channel {source!r} have the same stamp"
-        return InputError(text, "choose another clock in signals.time.source, or give signals.time.rate_hz")
-    if total < 2:
-        count = "only one sample" if total else "no sample"
-    elif np.isfinite(values).any():
-        count = f"only {usable} of {total} samples with a number and a stamp"
-    else:
-        count = f"no number among its {total} samples"
+        return InputError(text, cure)
+    if total > 1 and timed < 2:
+        return InputError(f"{channel} has a stamp at {timed or 'none'} of its {total} samples", cure)
     hint = f"check signals.{name}.source, or record again"
-    return InputError(f"{name}: the channel {source!r} has {count}", hint)
+    if total < 2:
+        return InputError(f"{channel} has {'only one' if total else 'no'} sample", hint)
+    return InputError(
+        f"{channel} has {'no number' if not usable else 'one number'} among its {total} samples", hint
+    )
 
 
 def _statistics(
