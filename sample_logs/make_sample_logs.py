@@ -36,22 +36,22 @@ AMPLITUDE_RAD = 0.08
 MOTOR_COUNTS = 65536
 JOINT_COUNTS = 524288
 TORQUE_NOISE_NM = 2.0
-START_NS = 1_000_000_000 * 1_000_000
-SEED = 2001
+START_NS = 1_000_000 * 1_000_000_000  # far from zero, as a real clock is; exact in float64 seconds
+SEED = 1
+AXIS = Axis()
+CONTROLLER = Controller(kp=8.0, kv=3000.0, ki=8000.0, velocity_feedforward=0.0)
+SENSORS = Sensors(
+    motor_resolution=2.0 * np.pi / MOTOR_COUNTS / GEAR_RATIO,
+    joint_resolution=2.0 * np.pi / JOINT_COUNTS,
+    torque_noise=TORQUE_NOISE_NM,
+)
 
 
-def main(folder: Path) -> None:
-    """Simulate, write every container, the truth and the sums."""
-    axis = Axis()
-    controller = Controller(kp=8.0, kv=3000.0, ki=8000.0, velocity_feedforward=0.0)
-    sensors = Sensors(
-        motor_resolution=2.0 * np.pi / MOTOR_COUNTS / GEAR_RATIO,
-        joint_resolution=2.0 * np.pi / JOINT_COUNTS,
-        torque_noise=TORQUE_NOISE_NM,
-    )
+def record(seed: int) -> LogTable:
+    """The simulated run with the torque noise of ``seed``, as a drive would log it."""
     reference = AMPLITUDE_RAD * chirp(*CHIRP_HZ, DURATION_S, SAMPLE_RATE_HZ)
-    run = simulate(axis, controller, reference, SAMPLE_RATE_HZ, sensors=sensors, seed=SEED)
-    table = LogTable(
+    run = simulate(AXIS, CONTROLLER, reference, SAMPLE_RATE_HZ, sensors=SENSORS, seed=seed)
+    return LogTable(
         stamps_ns=START_NS + np.rint(run.time_s * 1e9).astype(np.int64),
         channels={
             "/joint_states/motor/effort": np.round(run.torque / GEAR_RATIO / TORQUE_CONSTANT, 4),
@@ -66,6 +66,11 @@ def main(folder: Path) -> None:
             "/joint_states/reference/position": "rad",
         },
     )
+
+
+def main(folder: Path) -> None:
+    """Write every container, the truth and the sums."""
+    table = record(SEED)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "axis3.csv", table, overwrite=True)
     write_mcap(folder / "axis3.mcap", table, overwrite=True)
@@ -76,11 +81,11 @@ def main(folder: Path) -> None:
         write_rosbag2(target, table, storage=storage, compression="file")
     truth = {
         "source": "Pham, Gautier, Poignet, ICRA 2001, Table 1; joint side, SI",
-        "axis": asdict(axis),
-        "resonance_hz": axis.resonance_hz,
-        "antiresonance_hz": axis.antiresonance_hz,
-        "controller": asdict(controller),
-        "sensors": asdict(sensors),
+        "axis": asdict(AXIS),
+        "resonance_hz": AXIS.resonance_hz,
+        "antiresonance_hz": AXIS.antiresonance_hz,
+        "controller": asdict(CONTROLLER),
+        "sensors": asdict(SENSORS),
         "gear_ratio": GEAR_RATIO,
         "torque_constant_nm_per_a": TORQUE_CONSTANT,
         "sample_rate_hz": SAMPLE_RATE_HZ,

@@ -181,6 +181,18 @@ def torque_hold(model: Model, result: FitResult, columns: Columns) -> Array:
     return -_solve_normal(result, result.jacobian.T @ column)
 
 
+def gear_error(model: Model, result: FitResult, columns: Columns) -> Nuisance:
+    """Relative error of the gear ratio, and what it would do to the parameters; both encoders only.
+
+    A motor motion too large by a share e puts e qm into the torsion.
+    """
+    gradients = []
+    for block, a in zip(model.blocks, model.coefficients(result.theta), strict=True):
+        k = [signal for signal, _ in block.columns].index("torsion")
+        gradients.append(-a[k] * columns("motor", 0))
+    return _nuisance(result, gradients, columns.lengths)
+
+
 def left_out_flexibility(result: FitResult, columns: Columns) -> Nuisance:
     """JL^2/K that the rigid model leaves out, and what it would do to the parameters.
 

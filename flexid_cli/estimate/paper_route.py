@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 METHOD = "paper: 2 sigma, independent residuals"
+CAUTION = (
+    "route paper: its intervals suppose independent residuals and hold no bias; decide by the direct route"
+)
 # Probability of two sigma under the normal distribution.
 LEVEL = 0.9544997361036416
 NORMAL = 1e9
@@ -75,6 +78,7 @@ def solve_paper(columns: Columns, config: Config, model_id: str, tuning: Tuning)
     plain = config.model_copy(update={"estimate": config.estimate.model_copy(update={"covariance": "iid"})})
     table = summary.summarise(solution, plain, regression=False)
     estimates = tuple(_two_sigma(e) for e in table.parameters)
+    table = replace(table, warnings=(*table.warnings, f"{model_id}: {CAUTION}"))
     if model_id == "two_encoders":
         return replace(table, parameters=estimates)
     names, correlation, physical = _table_3(solution)

@@ -33,6 +33,9 @@ DERIVED = (
 SIGNIFICANT_DELAY_SAMPLES = 0.1
 SIGNIFICANT_SIGMA = 3.0
 HALF_SAMPLE_TOLERANCE = 0.2
+CLEAR_GEAR_SIGMA = 5.0
+# A ratio of tooth numbers is off by one tooth or not at all: by a thousandth for a ratio of a thousand.
+SMALLEST_GEAR_ERROR = 1e-3
 SPECTRUM_SEGMENT_S = 8.0
 # A uniform doubt between zero and the full shift has this standard deviation about zero.
 UNIFORM = 1.0 / np.sqrt(3.0)
@@ -52,12 +55,15 @@ class Uncertainty:
         The largest systematic source of each parameter where it exceeds the random part, else empty.
     delay : budget.Nuisance
         Torque delay as the residuals show it.
+    gear : budget.Nuisance or None
+        Relative error of the gear ratio, where both encoders show one clearly.
     """
 
     covariance: Array
     degrees_of_freedom: Array
     largest: tuple[str, ...]
     delay: budget.Nuisance
+    gear: budget.Nuisance | None = None
 
 
 def summarise(solution: Solution, config: Config, *, regression: bool = True) -> ModelResult:
@@ -135,6 +141,9 @@ def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -
         if model.id == "rigid":
             flexibility = budget.left_out_flexibility(result, columns)
             shifts["flexibility, which the rigid model leaves out"] = flexibility.shift(at_most=0.0)
+    gear = _clear_gear_error(solution)
+    if gear is not None:
+        shifts["a doubt about the gear ratio"] = gear.shift(at_most=0.0)
     random_part = misfit * result.covariance
     covariance = random_part + sum(np.outer(s, s) for s in shifts.values())
     random = np.maximum(np.diag(random_part), np.finfo(float).tiny)
@@ -145,7 +154,16 @@ def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -
         sizes = {name: abs(float(shift[k])) for name, shift in shifts.items()}
         name = max(sizes, key=sizes.__getitem__, default="")
         largest.append(name if name and shifts[name][k] ** 2 > random[k] else "")
-    return Uncertainty(covariance, dof, tuple(largest), delay)
+    return Uncertainty(covariance, dof, tuple(largest), delay, gear)
+
+
+def _clear_gear_error(solution: Solution) -> budget.Nuisance | None:
+    """The gear ratio's error where the residuals show one beyond doubt: it is a number that people look up."""
+    if solution.model.id != "two_encoders":
+        return None
+    gear = budget.gear_error(solution.model, solution.result, solution.columns)
+    clear = np.isfinite(gear.stderr) and abs(gear.value) > CLEAR_GEAR_SIGMA * gear.stderr
+    return gear if clear and abs(gear.value) > SMALLEST_GEAR_ERROR else None
 
 
 def _reported(model: Model, theta: Array, covariance: Array) -> tuple[tuple[Parameter, ...], Array, Array]:
@@ -366,9 +384,16 @@ def _warnings(solution: Solution, uncertainty: Uncertainty, config: Config, doub
     # With physics missing the residuals' delay is a symptom, not a timing that could be set.
     if not doubt:
         warnings += _delay_warning(solution, uncertainty.delay, config)
+    if uncertainty.gear is not None:
+        ratio = config.axis.gear_ratio * (1.0 + uncertainty.gear.value)
+        warnings.append(
+            f"{model}: motor and joint move as if the gear ratio were {ratio:.6g} instead of"
+            f" {config.axis.gear_ratio:.6g}; check axis.gear_ratio, or the transmission or gravity hides more"
+        )
     if not solution.result.converged:
         warnings.append(f"{model}: the fit did not settle; treat its numbers with care")
-    f1, band = solution.tuning.f1_hz, solution.columns.chain.band_hz
+    f1 = fitted_resonance(solution.model, solution.result.theta) or solution.tuning.f1_hz
+    band = solution.columns.chain.band_hz
     if f1 and model != "rigid" and band < f1:
         warnings.append(
             f"{model}: the effective band ends at {band:.3g} Hz, below the resonance at {f1:.3g} Hz"

@@ -96,12 +96,16 @@ def model_doubt(estimates: Sequence[Estimate], fit_percent: float) -> str:
     error that `identified` allows, shows that the model lacks something; its lack biases the others in a way that
     no interval of this model covers.
     """
-    forbidden = [e.symbol for e in estimates if e.reason.startswith(FORBIDDEN)]
-    if forbidden:
-        return f"{', '.join(forbidden)} came out with a sign that physics forbids: the model lacks something"
     unexplained = 100.0 - fit_percent
+    forbidden = [e for e in estimates if e.reason.startswith(FORBIDDEN)]
+    inertias = [e for e in estimates if e.name.endswith("inertia")]
+    if inertias and all(e.value is not None and e.value < 0.0 for e in inertias):
+        return "the inertia came out negative, as if torque and motion had opposite signs: check `sign` of the torque"
     if unexplained > IDENTIFIED_PERCENT:
         return f"the model leaves {unexplained:.0f} % of the torque unexplained: it lacks something"
+    if forbidden:
+        symbols = ", ".join(e.symbol for e in forbidden)
+        return f"{symbols} came out with a sign that physics forbids: the model lacks something"
     return ""
 
 

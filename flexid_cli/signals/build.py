@@ -346,12 +346,13 @@ def _delayed(role: str, signal: _Signal, config: Config, history: list[str]) -> 
         shift -= round(settings.delay_s * NS)
         history.append(f"{role}: stamps moved by {-settings.delay_s:g} s, the configured delay")
     if role not in POSITIONS:
-        half = round(0.5 * signal.track.period_ns)
+        held_ns = _hold_ns(signal.track, config)
+        half = round(0.5 * held_ns)
         if (config.signals.torque.hold or DEFAULT_TORQUE_HOLD) == "sample":
             shift += half
-            signal = replace(signal, track=_held(signal.track))
+            signal = replace(signal, track=_held(signal.track, held_ns))
             history.append(
-                f"{role}: each value is held for one sample: stamps moved {half / NS:g} s later, the hold's"
+                f"{role}: each value is held for {held_ns / NS:g} s: stamps moved {half / NS:g} s later, the hold's"
                 " damping sinc(f T) applied"
             )
         else:
@@ -361,8 +362,15 @@ def _delayed(role: str, signal: _Signal, config: Config, history: list[str]) -> 
     )
 
 
-def _held(track: Track) -> Track:
-    """Values as they act when each is held for one period T: damped by sinc(f T), to (w T)^4.
+def _hold_ns(track: Track, config: Config) -> float:
+    """How long a value is held: the controller's period, else one sample of the log."""
+    if config.controller is not None and config.controller.period_s is not None:
+        return config.controller.period_s * NS
+    return track.period_ns
+
+
+def _held(track: Track, held_ns: float) -> Track:
+    """Values as they act when each is held for a time T: damped by sinc(f T), to (w T)^4.
 
     sinc(f T) is 1 - (w T)^2 / 24 + ..., and -(w T)^2 the second difference.
     """
@@ -370,7 +378,9 @@ def _held(track: Track) -> Track:
         return track
     values = track.values.copy()
     for first, stop in track.segments:
-        values[first + 1 : stop - 1] += np.diff(track.values[first:stop], 2) / 24.0
+        values[first + 1 : stop - 1] += (
+            np.diff(track.values[first:stop], 2) * (held_ns / track.period_ns) ** 2 / 24.0
+        )
     return replace(track, values=values)
 
 
