@@ -11,7 +11,15 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from flexid_cli.config.schema import POSITION_ROLES, RULE_ERROR, TORQUE_ROLES, Config, nearest_word
+from flexid_cli.config.schema import (
+    PLACEHOLDER,
+    POSITION_ROLES,
+    RULE_ERROR,
+    TORQUE_ROLES,
+    UNFILLED,
+    Config,
+    nearest_word,
+)
 from flexid_cli.config.yaml12 import Path, parse_scalar, path_text
 
 if typing.TYPE_CHECKING:
@@ -175,6 +183,8 @@ def _explain_value(path: Path, errors: list[ErrorDetails], value: object) -> Fin
         return Finding(
             f"version {value} of the configuration is not known", path, "this flexid reads version: 1"
         )
+    if value == PLACEHOLDER:
+        return Finding(UNFILLED.format(label), path, f"replace it by {' or '.join(wants)}")
     message = f"{label} must be {' or '.join(wants)}, but is {_describe(value)}"
     hint = _hint_for(path, value, errors)
     return Finding(message, path, hint)

@@ -20,7 +20,9 @@ from flexid_cli.errors import UsageError
 from flexid_cli.units import Unit, known_units, parse_unit
 
 SCHEMA_ID = "urn:flexid:config:1"
+PLACEHOLDER = "FILL_IN"  # stands in a proposed configuration where the log does not tell the value
 RULE_ERROR = "flexid_rule"
+UNFILLED = "{} still holds the placeholder " + PLACEHOLDER
 TORQUE_ROLES = ("motor_current", "motor_torque", "joint_torque")
 POSITION_ROLES = ("motor_position", "joint_position", "reference_position")
 
@@ -428,7 +430,8 @@ def _rule_known_units(view: _View) -> Iterator[BrokenRule]:
         if unit is None:
             guess = nearest_word(text, permitted)
             hint = f"did you mean {guess}? {listing}" if guess else listing
-            yield BrokenRule(f"unknown unit {text!r}", path, hint)
+            message = UNFILLED.format("unit") if text == PLACEHOLDER else f"unknown unit {text!r}"
+            yield BrokenRule(message, path, listing if text == PLACEHOLDER else hint)
         elif unit.dimension not in _permitted_dimensions(role):
             yield BrokenRule(f"{role} cannot be in {unit.name}, a unit of {unit.dimension}", path, listing)
 

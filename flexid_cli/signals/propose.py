@@ -7,11 +7,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from flexid_cli.config.schema import PLACEHOLDER
 from flexid_cli.errors import UsageError
 from flexid_cli.signals.inspect import ChannelSummary, Inspection
 from flexid_cli.units import known_units, parse_unit
-
-PLACEHOLDER = "FILL_IN"
 
 _POSITION = frozenset(
     (
