@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -231,9 +233,7 @@ def test_sign_is_averaged_over_the_sample_and_the_average_undone(width):
     v = columns.motor_velocity[0]
     middle = np.concatenate([v[:1], 0.5 * (v[1:] + v[:-1]), v[-1:]])
     steps = (np.arange(4000) + 0.5) / 4000
-    average = np.array(
-        [np.tanh((a + (b - a) * steps) / width).mean() for a, b in zip(middle[:-1], middle[1:], strict=True)]
-    )
+    average = np.array([np.tanh((a + (b - a) * steps) / width).mean() for a, b in pairwise(middle)])
     expected = average.copy()
     expected[1:-1] -= np.diff(average, 2) / 24.0
     # The sum errs by half a step where a jump falls into it.
