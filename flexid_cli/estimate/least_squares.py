@@ -75,6 +75,8 @@ def solve(W: Array, Y: Array) -> LeastSquares:
         raise DataError(
             "a column of the observation matrix is zero", "a signal does not move; check the signals"
         )
+    # Powers of two: the scaled matrix is the given one to the last bit.
+    scale = np.exp2(np.round(np.log2(scale)))
     scaled = W / scale
     Q, R = np.linalg.qr(scaled)
     singular = np.linalg.svd(R, compute_uv=False)
