@@ -20,6 +20,7 @@ from flexid_cli.cli.options import (
     verbosity_options,
     wants_color,
 )
+from flexid_cli.cli.reading import read_options, reading, warn_of_damage
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,8 +28,10 @@ if TYPE_CHECKING:
 
     from flexid_cli.config.schema import Config
     from flexid_cli.estimate.result import Identification
-    from flexid_cli.readers.base import RawLog
+    from flexid_cli.readers.base import Damage as RawDamage
+    from flexid_cli.readers.base import RawLog, ReadOptions
     from flexid_cli.report.document import InputFile
+    from flexid_cli.signals.recording import Recording
 
 NOTHING_IDENTIFIED = 3
 QUIETEST = -1  # with -qq the report stays out too
@@ -50,6 +53,7 @@ QUIETEST = -1  # with -qq the report stays out too
     " Gautier and Poignet, two sigma and Table 3's inversion included.",
 )
 @set_option
+@read_options
 @json_option
 @output_option
 @force_option
@@ -61,6 +65,10 @@ def identify(
     config: Path,
     route: str | None,
     overrides: tuple[str, ...],
+    start: float | None,
+    end: float | None,
+    strict: bool,
+    keep_suspect: bool,
     as_json: bool,
     outputs: tuple[Path, ...],
     force: bool,
@@ -74,13 +82,16 @@ def identify(
     """
     from flexid_cli.config.load import load_config
     from flexid_cli.report.write import check_formats
+    from flexid_cli.signals.build import build_recording
 
     check_formats([path for path in outputs if path != STDOUT])
     check_outputs(outputs, force=force, inputs=[*logs, config])
     if route is not None:
         overrides = (*overrides, f"estimate.route={route}")
     loaded = load_config(config, overrides)
-    identification, document = run_identify(logs, loaded, console)
+    with reading(console, start, end, strict=strict, keep_suspect=keep_suspect) as options:
+        recording, raw = build_recording(logs, loaded, options)
+    identification, document = run_identify(logs, loaded, console, recording, raw, options)
     _write([path for path in outputs if path != STDOUT], document, identification, console, force=force)
     if as_json or STDOUT in outputs:
         from flexid_cli.report.json import render_json
@@ -97,15 +108,19 @@ def identify(
 
 
 def run_identify(
-    logs: Sequence[Path], config: Config, console: Console
+    logs: Sequence[Path],
+    config: Config,
+    console: Console,
+    recording: Recording,
+    raw: RawLog,
+    options: ReadOptions,
 ) -> tuple[Identification, dict[str, Any]]:
-    """Read, identify, and build the report document."""
+    """Identify, and build the report document."""
     from flexid_cli.config.load import config_digest
     from flexid_cli.estimate.identify import identify as estimate
     from flexid_cli.report.document import build_document
-    from flexid_cli.signals.build import build_recording
 
-    recording, raw = build_recording(logs, config)
+    warn_of_damage(console, raw.damage, suspect_kept=options.keep_suspect)
     console.detail(f"read {recording.samples} samples at {recording.sample_rate_hz:.6g} Hz from {raw.format}")
     for step in recording.history:
         console.detail(f"  {step}")
@@ -122,13 +137,26 @@ def run_identify(
 
 def _inputs(logs: Sequence[Path], raw: RawLog) -> list[InputFile]:
     from flexid_cli.readers.digest import digest
-    from flexid_cli.report.document import InputFile
+    from flexid_cli.report.document import Damage, InputFile
 
     notes = tuple(note.message for note in raw.notes)
+    damage = dict(zip(raw.paths, raw.damage, strict=False))
     return [
-        InputFile(path=str(log), sha256=digest(log), format=raw.format, notes=notes if k == 0 else ())
+        InputFile(
+            path=str(log),
+            sha256=digest(log),
+            format=raw.format,
+            damage=None if log not in damage else Damage(**_fields_of(damage[log])),
+            notes=notes if k == 0 else (),
+        )
         for k, log in enumerate(logs)
     ]
+
+
+def _fields_of(damage: RawDamage) -> dict[str, Any]:
+    from dataclasses import fields
+
+    return {field.name: getattr(damage, field.name) for field in fields(damage) if field.name != "path"}
 
 
 def _write(

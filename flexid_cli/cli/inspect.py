@@ -16,6 +16,7 @@ from flexid_cli.cli.options import (
     pass_console,
     verbosity_options,
 )
+from flexid_cli.cli.reading import read_options, reading, warn_of_damage
 
 if TYPE_CHECKING:
     from flexid_cli.signals.inspect import ChannelSummary, Inspection
@@ -39,12 +40,21 @@ COLUMNS = ("samples", "rate Hz", "jitter %", "gaps", "min", "max", "unit")
     type=click.Path(path_type=Path),
     help="Write the proposed configuration to FILE.",
 )
+@read_options
 @json_option
 @force_option
 @verbosity_options
 @pass_console
 def inspect(
-    console: Console, logs: tuple[Path, ...], config_file: Path | None, as_json: bool, force: bool
+    console: Console,
+    logs: tuple[Path, ...],
+    config_file: Path | None,
+    start: float | None,
+    end: float | None,
+    strict: bool,
+    keep_suspect: bool,
+    as_json: bool,
+    force: bool,
 ) -> None:
     """List the channels of a log: rates, gaps, clock jitter, units, range; propose a configuration.
 
@@ -55,7 +65,8 @@ def inspect(
 
     if config_file is not None:
         check_outputs([config_file], force=force, inputs=logs)
-    inspection = inspect_log(logs)
+    with reading(console, start, end, strict=strict, keep_suspect=keep_suspect) as options:
+        inspection = inspect_log(logs, options=options)
     proposal = propose_config(inspection)
     if as_json:
         import json
@@ -67,6 +78,7 @@ def inspect(
         if config_file is None:
             click.echo("\nProposed configuration (--write-config FILE writes it):\n")
             click.echo(proposal, nl=False)
+    warn_of_damage(console, inspection.damage, suspect_kept=keep_suspect)
     for note in inspection.notes:
         console.warning(note)
     if config_file is not None:

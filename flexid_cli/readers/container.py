@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.errors import InputError
-from flexid_cli.readers.base import ChannelInfo, Note, RawChannel, RawLog
-from flexid_cli.readers.damage import damaged, decoding
+from flexid_cli.readers.base import (
+    DEFAULT_OPTIONS,
+    ChannelInfo,
+    Damage,
+    Note,
+    RawChannel,
+    RawLog,
+    ReadOptions,
+    Window,
+)
+from flexid_cli.readers.batch import Batch
+from flexid_cli.readers.damage import CURE, damaged, decoding
 from flexid_cli.readers.decoders import Decoder, TopicType, make_decoder
-from flexid_cli.readers.messages import Column, leaves_of, needs_integers, stamp_ns
+from flexid_cli.readers.gather import TopicOutput
+from flexid_cli.readers.layout import LayoutDecoder
+from flexid_cli.readers.loss import Loss
+from flexid_cli.readers.messages import leaves_of
 from flexid_cli.readers.path import Leaf, canonical, may_name, resolve, spellings
 
 CLOCKS = ("header_stamp", "log_time", "publish_time")
 _LOOKED_AT = 100  # messages per topic and file that are decoded to see what a topic holds
 _LOOKED_AT_BYTES = 1 << 20
-
-
-class Message(NamedTuple):
-    """One message as it stands in the log; times in nanoseconds, ``publish_time`` where it is recorded."""
-
-    kind: TopicType
-    log_time: int
-    publish_time: int | None
-    data: bytes
+_NS = 1_000_000_000
+_MOST_REASONS = 20
 
 
 @dataclass
@@ -53,17 +58,32 @@ class Probe:
 
 
 class Container(Protocol):
-    """One open file of a message log."""
+    """One open file of a message log.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    notes : list of Note
+        What a person should know.
+    loss : Loss
+        Damage that was met since the last call of ``batches`` began.
+    """
 
     path: Path
     notes: list[Note]
+    loss: Loss
 
     def probe(self) -> Probe:
-        """Look at the file without decoding it; raises InputError where it is damaged."""
+        """Look at the file without decoding it."""
         ...
 
-    def messages(self, wanted: Callable[[str], bool]) -> Iterator[Message]:
-        """Yield the messages of the topics that ``wanted`` accepts, in the order they were recorded."""
+    def batches(self, wanted: Callable[[str], bool], window: Window) -> Iterator[Batch]:
+        """Yield the messages of the topics that ``wanted`` accepts, in the order they were recorded.
+
+        Messages outside the window may be among them where leaving them out would not save reading. A batch
+        is valid until the next one is asked for.
+        """
         ...
 
 
@@ -74,7 +94,9 @@ class MessageReader(ABC):
     suffixes: tuple[str, ...]
 
     @abstractmethod
-    def open_files(self, paths: Sequence[Path]) -> AbstractContextManager[tuple[list[Container], list[Note]]]:
+    def open_files(
+        self, paths: Sequence[Path], options: ReadOptions = DEFAULT_OPTIONS
+    ) -> AbstractContextManager[tuple[list[Container], list[Note]]]:
         """Open all files of one run."""
 
     def channels(self, paths: Sequence[Path]) -> list[ChannelInfo]:
@@ -89,40 +111,97 @@ class MessageReader(ABC):
             run = _Run(files)
             return sorted(run.listing(), key=lambda info: info.source)
 
-    def read(self, paths: Sequence[Path], sources: Sequence[str]) -> RawLog:
+    def read(
+        self, paths: Sequence[Path], sources: Sequence[str], options: ReadOptions = DEFAULT_OPTIONS
+    ) -> RawLog:
         """Read the channels ``sources``, all files as one recording, ordered by their first log time.
 
         Raises
         ------
         InputError
-            The log is damaged, or a channel is missing or ambiguous.
+            A channel is missing or ambiguous, nothing can be read, or the log is damaged and the options are
+            strict.
         """
-        with self.open_files(paths) as (files, notes):
-            run = _Run(files)
+        with self.open_files(paths, options) as (files, notes):
+            run = _Run(files, [str(source) for source in sources])
             leaves = run.resolve_all([str(source) for source in sources])
-            channels, read_notes = run.read(leaves)
+            channels, read_notes = run.read(leaves, options)
+            damage = _by_path(paths, run.damage)
             found = [*notes, *(note for file in files for note in file.notes), *read_notes]
-        return RawLog(self.name, tuple(paths), channels, tuple(dict.fromkeys(found)))
+            first_ns = run.first_ns
+        return RawLog(self.name, tuple(paths), channels, tuple(dict.fromkeys(found)), damage, first_ns)
+
+
+def _by_path(paths: Sequence[Path], parts: Sequence[Damage]) -> tuple[Damage, ...]:
+    """Give one account per path that was asked for; the files of a folder are added up."""
+    accounts = []
+    for path in paths:
+        mine = [part for part in parts if part.path == path or path in part.path.parents]
+        lost = [part.lost for part in mine]
+        accounts.append(
+            Damage(
+                path,
+                trusted=sum(part.trusted for part in mine),
+                suspect=sum(part.suspect for part in mine),
+                lost=None if None in lost else sum(count or 0 for count in lost),
+                lost_bytes=sum(part.lost_bytes for part in mine),
+                lost_chunks=sum(part.lost_chunks for part in mine),
+                spans_s=tuple(span for part in mine for span in part.spans_s),
+                reasons=tuple(reason for part in mine for reason in part.reasons),
+            )
+        )
+    return tuple(accounts)
 
 
 class _Run:
-    """The files of one run, looked at and put in order."""
+    """The files of one run, looked at and put in order.
 
-    def __init__(self, files: Sequence[Container]) -> None:
+    Parameters
+    ----------
+    files : sequence of Container
+        The files.
+    sources : sequence of str, optional
+        Signal paths that will be asked for; topics that none of them can name are looked at only where one
+        is not found. Without it all topics are looked at.
+    """
+
+    def __init__(self, files: Sequence[Container], sources: Sequence[str] | None = None) -> None:
         probes = [(file, file.probe()) for file in files]
         filled = [(file, probe) for file, probe in probes if probe.first_log_time is not None]
         if not filled:
-            raise InputError(f"{files[0].path} holds no messages", "check that the recorder was subscribed")
+            raise _nothing(files[0])
         self.files = sorted(filled, key=lambda pair: pair[1].first_log_time or 0)
+        self.empty = [file for file, probe in probes if probe.first_log_time is None]
+        self.first_ns = self.files[0][1].first_log_time or 0
         self.log = str(self.files[0][0].path)
+        self.damage: list[Damage] = []
         self._decoders: dict[TopicType, Decoder | InputError] = {}
         self._failures: dict[str, InputError] = {}
         self._leaves: dict[str, dict[str, Leaf]] = {}
         self._seen: dict[str, dict[str, int]] = {}
         self._samples: dict[str, int] = {}
+        self._looked_at: set[tuple[Path, TopicType]] = set()
+        self._look_at_first(sources)
+
+    def _look_at_first(self, sources: Sequence[str] | None) -> None:
+        """Look at the first messages of the topics that ``sources`` can name, or of all."""
         for file, probe in self.files:
             for kind, samples in probe.samples.items():
-                self._look(file.path, kind, samples)
+                named = sources is None or any(may_name(source, kind.topic) for source in sources)
+                if named and (file.path, kind) not in self._looked_at:
+                    self._looked_at.add((file.path, kind))
+                    self._look(file.path, kind, self._unlike(file.path, kind, samples))
+
+    def _unlike(self, path: Path, kind: TopicType, samples: Sequence[bytes]) -> Sequence[bytes]:
+        """Leave out samples that have the layout of another one, and so the same numbers in them."""
+        lengths = np.array([len(data) for data in samples], dtype=np.int64)
+        content = np.frombuffer(b"".join(samples), dtype=np.uint8)
+        batch = Batch(kind, content, np.cumsum(lengths) - lengths, lengths, np.zeros_like(lengths), None)
+        try:
+            self.decoder(path, kind)
+            return LayoutDecoder(kind, ()).unlike(batch)
+        except InputError:
+            return samples  # looking at them gives the reason
 
     @property
     def topics(self) -> list[str]:
@@ -184,7 +263,11 @@ class _Run:
             except InputError:
                 self._refuse_undecodable(source)
                 self._look_at_all(source)
-                resolved[source] = self._resolve(source)
+                try:
+                    resolved[source] = self._resolve(source)
+                except InputError:
+                    self._look_at_first(None)  # so that the nearest channels of other topics are named too
+                    resolved[source] = self._resolve(source)
         return resolved
 
     def _resolve(self, source: str) -> Leaf:
@@ -197,28 +280,71 @@ class _Run:
                 raise error
 
     def _look_at_all(self, source: str) -> None:
+        """Look at one message of every layout of the topics that ``source`` can name."""
         for file, _ in self.files:
-            for message in file.messages(lambda topic: may_name(source, topic)):
-                self._look(file.path, message.kind, [message.data])
+            decoders: dict[TopicType, LayoutDecoder] = {}
+            for batch in file.batches(lambda topic: may_name(source, topic), Window()):
+                if not batch.trusted:
+                    continue
+                decoder = decoders.get(batch.kind)
+                if decoder is None:
+                    self.decoder(file.path, batch.kind)
+                    decoder = decoders[batch.kind] = LayoutDecoder(batch.kind, ())
+                self._look(file.path, batch.kind, decoder.unlike(batch))
 
-    def read(self, resolved: Mapping[str, Leaf]) -> tuple[dict[str, RawChannel], list[Note]]:
+    def read(
+        self, resolved: Mapping[str, Leaf], options: ReadOptions = DEFAULT_OPTIONS
+    ) -> tuple[dict[str, RawChannel], list[Note]]:
         """Read the resolved channels; keys are the spellings that were asked for."""
         unique = {canonical(leaf): leaf for leaf in resolved.values()}
-        gathered = {leaf.topic: _Topic(leaf.topic) for leaf in unique.values()}
-        for name, leaf in unique.items():
-            gathered[leaf.topic].columns[name] = Column(leaf)
-        for file, _ in self.files:
-            for message in file.messages(gathered.__contains__):
-                decode = self.decoder(file.path, message.kind)
-                gathered[message.kind.topic].add(file.path, decode, message)
+        topics = list(dict.fromkeys(leaf.topic for leaf in unique.values()))
+        outputs = {
+            topic: TopicOutput(
+                topic,
+                [leaf for leaf in unique.values() if leaf.topic == topic],
+                self._expected(topic, options),
+            )
+            for topic in topics
+        }
+        reading = _Reading(self, outputs, options)
+        tallies = [reading.read_file(file) for file, _ in self.files]
+        for topic, output in outputs.items():
+            if output.size == 0:
+                raise self._empty(topic, options)
         notes: list[Note] = []
         finished: dict[str, RawChannel] = {}
-        for topic in gathered.values():
-            finished.update(topic.finish(self.log, notes))
-        notes += self._schema_notes(gathered)
+        for output in outputs.values():
+            finished.update(output.finish(self.log, notes, keep_suspect=options.keep_suspect))
+            for tally in tallies:
+                tally.doubt(output)
+        accounts = [(file, _Tally()) for file in self.empty]
+        accounts += [(file, tally) for (file, _), tally in zip(self.files, tallies, strict=True)]
+        self.damage = [_account(file, tally, self.first_ns, options) for file, tally in accounts]
+        notes += self._schema_notes(outputs)
         return {source: finished[canonical(leaf)] for source, leaf in resolved.items()}, notes
 
-    def _schema_notes(self, topics: Mapping[str, Any]) -> list[Note]:
+    def _empty(self, topic: str, options: ReadOptions) -> InputError:
+        """Return the error for a topic of which no message could be read."""
+        for file, _ in self.files:
+            if file.loss.reasons:
+                return damaged(
+                    file.path, f"no message of topic {topic!r} can be read; {file.loss.reasons[0]}"
+                )
+        if not options.window(self.first_ns).is_open:
+            return InputError(
+                f"{self.log}: topic {topic!r} has no messages in the time window",
+                "--start and --end count seconds from the first message of the log",
+            )
+        return damaged(Path(self.log), f"no message of topic {topic!r} can be read")
+
+    def _expected(self, topic: str, options: ReadOptions) -> int:
+        """Number of messages that a topic seems to have; for a window it cannot be told."""
+        if not options.window(self.first_ns).is_open:
+            return 0
+        counts = (probe.counts for _, probe in self.files)
+        return sum(count for by_kind in counts for kind, count in by_kind.items() if kind.topic == topic)
+
+    def _schema_notes(self, topics: Mapping[str, TopicOutput]) -> list[Note]:
         return [
             Note(
                 f"{file.path}: the log does not describe message type {kind.msgtype!r} of topic "
@@ -230,76 +356,132 @@ class _Run:
         ]
 
 
-class _Topic:
-    """The messages of one topic: stamps by clock, and the columns asked for."""
+@dataclass
+class _Tally:
+    """Messages of one file as they were read."""
 
-    def __init__(self, topic: str) -> None:
-        self.topic = topic
-        self.columns: dict[str, Column] = {}
-        self._log = array("q")
-        self._publish: array[int] | None = array("q")
-        self._header: array[int] | None = array("q")
+    trusted: int = 0
+    suspect: int = 0
+    bad: int = 0
+    reasons: list[str] = field(default_factory=list)
+    places: dict[str, tuple[int, int]] = field(default_factory=dict)  # its messages in the topics' outputs
 
-    def add(self, path: Path, decode: Decoder, message: Message) -> None:
-        """Decode one message and take its numbers."""
-        row = len(self._log)
-        with decoding(path, f"message {row + 1} of topic {self.topic!r} at {message.log_time} ns"):
-            content = decode(message.data)
-        self._log.append(message.log_time)
-        self._header = _extended(self._header, stamp_ns(content))
-        self._publish = _extended(self._publish, message.publish_time)
-        for column in self.columns.values():
-            column.take(content, row)
-
-    def finish(self, log: str, notes: list[Note]) -> dict[str, RawChannel]:
-        """Return the channels, and add to ``notes`` what a person should know."""
-        stamps = {"log_time": np.array(self._log, dtype=np.int64)}
-        if self._publish is not None:
-            stamps["publish_time"] = np.array(self._publish, dtype=np.int64)
-        if self._header is not None:
-            header = np.array(self._header, dtype=np.int64)
-            if header.any():
-                stamps["header_stamp"] = header
-            else:
-                notes.append(
-                    Note(f"{log}: the header stamps of topic {self.topic!r} are all zero, so not used")
-                )
-        return {
-            name: self._channel(name, column, stamps, log, notes) for name, column in self.columns.items()
-        }
-
-    def _channel(
-        self,
-        name: str,
-        column: Column,
-        stamps: Mapping[str, NDArray[np.int64]],
-        log: str,
-        notes: list[Note],
-    ) -> RawChannel:
-        rows = column.rows
-        if rows.size == 0:
-            raise damaged(Path(log), f"no message of topic {self.topic!r} has channel {name!r}")
-        if rows.size < len(self._log):
-            lacking = len(self._log) - rows.size
-            notes.append(Note(f"{log}: {lacking} of {len(self._log)} messages lack channel {name!r}"))
-            stamps = {clock: times[rows] for clock, times in stamps.items()}
-        integers = column.integers
-        exact = integers if integers is not None and needs_integers(integers) else None
-        if exact is not None:
-            notes.append(
-                Note(f"{log}: channel {name!r} holds integers beyond 2^53; as numbers they are rounded")
-            )
-        return RawChannel(name, column.values, dict(stamps), exact=exact)
+    def doubt(self, output: TopicOutput) -> None:
+        """Count this file's messages with samples that are not plausible as suspect."""
+        first, end = self.places.get(output.topic, (0, 0))
+        mine = [doubt.rows[(doubt.rows >= first) & (doubt.rows < end)] for doubt in output.doubts]
+        self.reasons += [doubt.reason for doubt, rows in zip(output.doubts, mine, strict=True) if rows.size]
+        count = np.unique(np.concatenate(mine)).size if mine else 0
+        self.trusted -= count
+        self.suspect += count
 
 
-def _extended(times: array[int] | None, time: int | None) -> array[int] | None:
-    """Append ``time``, or give the clock up where one message lacks it."""
-    if times is None or time is None:
-        return None
-    times.append(time)
-    return times
+class _Reading:
+    """One pass over the files of a run.
+
+    Parameters
+    ----------
+    run : _Run
+        Whose files are read.
+    outputs : dict of str to TopicOutput
+        Where the samples go, by topic.
+    options : ReadOptions
+        The window, and what is done with damage.
+    """
+
+    def __init__(self, run: _Run, outputs: Mapping[str, TopicOutput], options: ReadOptions) -> None:
+        self._run = run
+        self._outputs = outputs
+        self._options = options
+        self._window = options.window(run.first_ns)
+        self._named: dict[Leaf, str] = {}
+        self._decoders: dict[tuple[TopicType, bool], LayoutDecoder] = {}
+
+    def read_file(self, file: Container) -> _Tally:
+        """Read one file and return what was found in it."""
+        tally = _Tally()
+        before = {topic: output.size for topic, output in self._outputs.items()}
+        for batch in file.batches(self._outputs.__contains__, self._window):
+            self._add(file.path, within(batch, self._window), tally)
+        tally.places = {topic: (before[topic], output.size) for topic, output in self._outputs.items()}
+        return tally
+
+    def _add(self, path: Path, batch: Batch, tally: _Tally) -> None:
+        count = batch.starts.size
+        if not batch.trusted:
+            tally.suspect += count
+            if not self._options.keep_suspect:
+                return
+        if count == 0:
+            return
+        output = self._outputs[batch.kind.topic]
+        decoded = self._decoder(path, batch).decode(batch)
+        bad = int(np.count_nonzero(decoded.bad))
+        if bad:
+            self._lose(batch, decoded.bad, decoded.reason, tally)
+        if batch.trusted:
+            tally.trusted += count - bad
+        output.add(batch, decoded)
+
+    def _lose(self, batch: Batch, bad: NDArray[np.bool_], reason: str, tally: _Tally) -> None:
+        if not batch.trusted:
+            return
+        count = int(np.count_nonzero(bad))
+        tally.bad += count
+        first = int(batch.log_time[bad][0])
+        noun = "message" if count == 1 else "messages"
+        tally.reasons.append(
+            f"{count} {noun} of topic {batch.kind.topic!r} from {first} ns on cannot be decoded ({reason})"
+        )
+
+    def _decoder(self, path: Path, batch: Batch) -> LayoutDecoder:
+        key = batch.kind, batch.trusted
+        if key not in self._decoders:
+            self._run.decoder(path, batch.kind)  # raises what is wrong with the type
+            # what stands in messages that may be wrong must not decide about the others
+            named = self._named if batch.trusted else {}
+            leaves = self._outputs[batch.kind.topic].leaves
+            self._decoders[key] = LayoutDecoder(batch.kind, leaves, named)
+        return self._decoders[key]
 
 
-def enter_all(stack: ExitStack, opened: Sequence[AbstractContextManager[Container]]) -> list[Container]:
-    """Enter all files into ``stack``."""
-    return [stack.enter_context(file) for file in opened]
+def within(batch: Batch, window: Window) -> Batch:
+    """Return the messages of ``batch`` whose log time lies in ``window``."""
+    if window.is_open:
+        return batch
+    inside = window.holds(batch.log_time)
+    if bool(inside.all()):
+        return batch
+    published = None if batch.publish_time is None else batch.publish_time[inside]
+    return replace(
+        batch,
+        starts=batch.starts[inside],
+        lengths=batch.lengths[inside],
+        log_time=batch.log_time[inside],
+        publish_time=published,
+    )
+
+
+def _account(file: Container, tally: _Tally, first_ns: int, options: ReadOptions) -> Damage:
+    """Return what could be read of ``file`` and what was lost; raise it where the options are strict."""
+    loss = file.loss
+    damage = Damage(
+        file.path,
+        trusted=tally.trusted,
+        suspect=tally.suspect,
+        lost=None if loss.messages is None else loss.messages + tally.bad,
+        lost_bytes=loss.size,
+        lost_chunks=loss.chunks,
+        spans_s=tuple(((first - first_ns) / _NS, (last - first_ns) / _NS) for first, last in loss.spans_ns),
+        reasons=(*loss.reasons, *tally.reasons[:_MOST_REASONS]),
+    )
+    if options.strict and (damage.reasons or not damage.is_harmless):
+        detail = damage.reasons[0] if damage.reasons else f"{damage.suspect} messages may be wrong"
+        raise InputError(f"{file.path} is damaged: {detail}", CURE)
+    return damage
+
+
+def _nothing(file: Container) -> InputError:
+    if file.loss.reasons:
+        return damaged(file.path, f"nothing in it can be read; {file.loss.reasons[0]}")
+    return InputError(f"{file.path} holds no messages", "check that the recorder was subscribed")

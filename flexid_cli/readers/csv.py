@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import codecs
 import io
-import zlib
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.errors import InputError
-from flexid_cli.readers.base import ChannelInfo, Note, RawChannel, RawLog
-from flexid_cli.readers.damage import decoding, unreadable
+from flexid_cli.readers.base import (
+    DEFAULT_OPTIONS,
+    ChannelInfo,
+    Damage,
+    Progress,
+    RawChannel,
+    RawLog,
+    ReadOptions,
+)
+from flexid_cli.readers.damage import CURE
 from flexid_cli.readers.dialect import (
-    MISSING,
-    WHITESPACE,
     Detect,
     Dialect,
     Options,
@@ -27,20 +33,22 @@ from flexid_cli.readers.dialect import (
     detect_encoding,
     is_missing,
     is_number,
-    is_whole,
     split_line,
 )
+from flexid_cli.readers.lines import Block, Cutter, in_order, is_like_ascii, unified
+from flexid_cli.readers.memory import keep_freed_memory
 from flexid_cli.readers.messages import needs_integers
+from flexid_cli.readers.packed import Fault, pieces
 from flexid_cli.readers.path import missing_channel
+from flexid_cli.readers.rows import RowReader, Rows
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-GZIP_MAGIC = b"\x1f\x8b"
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_BLOCK = 1 << 22  # characters parsed at once
 _HEAD = 1 << 18
-_READ = 1 << 20
+_SPLICE = 1 << 16  # samples converted in place at once
+# Damage leaves most lines whole. Where more than this share of them does not fit, the table is not written
+# as it seems to be, and what does fit may be read wrong.
+_MOST_BAD = 0.1
+_TOLD = 5  # bad lines of a file that are told one by one
+_SOON = 100_000  # bad lines after which their share is looked at before the end
 
 
 class CsvReader:
@@ -63,12 +71,22 @@ class CsvReader:
         if not head or path.is_dir():
             return False
         try:
-            start = _Bytes(path).head()
-            lines, _ = _first_lines(start, self.options, path)
+            lines, _ = _first_lines(_head(path), self.options, path)
             dialect = detect(lines, self.options, name=str(path))
         except InputError:
             return False
         return _is_table(lines, dialect)
+
+    def columns(self, paths: Sequence[Path]) -> list[str]:
+        """List the names of the columns that hold numbers, by the first lines only.
+
+        Raises
+        ------
+        InputError
+            The table cannot be read without guessing.
+        """
+        dialect = self._open(paths)[0].dialect
+        return [one.name for one, numeric in zip(dialect.fields, dialect.numeric, strict=True) if numeric]
 
     def channels(self, paths: Sequence[Path]) -> list[ChannelInfo]:
         """List the columns that hold numbers, with the unit that the header declares.
@@ -79,7 +97,7 @@ class CsvReader:
             The table cannot be read without guessing.
         """
         tables = self._open(paths)
-        rows = sum(block.rows for table in tables for block in table.blocks())
+        rows = sum(table.count() for table in tables)
         dialect = tables[0].dialect
         return [
             ChannelInfo(one.name, rows, one.unit, "column", _aliases(one.name, one.text, place))
@@ -87,31 +105,40 @@ class CsvReader:
             if dialect.numeric[place - 1]
         ]
 
-    def read(self, paths: Sequence[Path], sources: Sequence[str | int]) -> RawLog:
+    def read(
+        self, paths: Sequence[Path], sources: Sequence[str | int], options: ReadOptions = DEFAULT_OPTIONS
+    ) -> RawLog:
         """Read columns by name or by number from 1; several files are appended in the given order.
+
+        Lines that are damaged give no sample and are counted in ``RawLog.damage``. A table has no time of its
+        own, so the window of ``options`` is left to who knows its time column.
 
         Raises
         ------
         InputError
-            A column is missing, holds a text, or the table cannot be read without guessing.
+            A column is missing, the table cannot be read without guessing, it holds no sample that can be
+            trusted, or it is damaged and ``options`` are strict.
         """
         tables = self._open(paths)
+        keep_freed_memory()
         places = {str(source): tables[0].place(source) for source in sources}
-        wanted = sorted(set(places.values()))
-        gathered: dict[int, list[NDArray[Any]]] = {place: [] for place in wanted}
-        for table in tables:
-            for block in table.blocks():
-                for place, values in table.numbers(block, wanted).items():
-                    gathered[place].append(values)
-        notes = [note for table in tables for note in table.notes]
+        progress = Progress(options, sum(_size(path) for path in paths))
+        columns = {place: _Column() for place in sorted(set(places.values()))}
+        suspect: list[tuple[int, int]] = []
+        damage = [table.read(columns, suspect, options, progress) for table in tables]
+        total = next(iter(columns.values())).size if columns else 0
+        marks = _mask(suspect, total)
+        good = None if marks is None or options.keep_suspect else ~marks
+        if total == 0 or (good is not None and not good.any()):
+            raise _nothing(paths[0], damage, total)
         fields = tables[0].dialect.fields
+        kept = marks if options.keep_suspect else None
         channels = {
-            place: _channel(fields[place].name, fields[place].unit, gathered[place]) for place in wanted
+            place: column.channel(fields[place].name, fields[place].unit, good, kept)
+            for place, column in columns.items()
         }
-        if not channels or not next(iter(channels.values())).values.size:
-            raise InputError(f"{paths[0]} has no data rows", "check that the log was written to its end")
         read = {source: channels[place] for source, place in places.items()}
-        return RawLog(self.name, tuple(paths), read, tuple(notes))
+        return RawLog(self.name, tuple(paths), read, damage=tuple(damage))
 
     def _open(self, paths: Sequence[Path]) -> list[_Table]:
         tables = [_Table(path, self.options) for path in paths]
@@ -125,91 +152,169 @@ class CsvReader:
         return tables
 
 
-@dataclass(frozen=True)
-class _Block:
-    """Whole lines of samples, without comments and blank lines.
-
-    Attributes
-    ----------
-    text : str
-        The lines.
-    rows : int
-        Their number.
-    lines : sequence of int
-        Number of each line in the file, from 1.
-    """
-
-    text: str
-    rows: int
-    lines: Sequence[int]
+def _nothing(path: Path, damage: Sequence[Damage], suspect: int) -> InputError:
+    reasons = [reason for one in damage for reason in one.reasons]
+    if suspect:
+        return InputError(
+            f"no sample of {path} can be trusted: {reasons[0]}",
+            f"{CURE}; `--keep-suspect` gives the {suspect} samples that may be wrong",
+        )
+    if reasons:
+        return InputError(f"{path} has no data rows that can be read: {reasons[0]}", CURE)
+    return InputError(f"{path} has no data rows", "check that the log was written to its end")
 
 
-class _Bytes:
-    """The unpacked bytes of a file; ``cut`` tells afterwards whether a packed file is cut short."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.cut = False
-
-    def head(self) -> bytes:
-        """Return the first bytes."""
-        start = b""
-        for block in self:
-            start += block
-            if len(start) >= _HEAD:
-                break
-        return start[:_HEAD]
-
-    def __iter__(self) -> Iterator[bytes]:
-        try:
-            with self.path.open("rb") as stream:
-                start = stream.read(4)
-                stream.seek(0)
-                blocks = iter(lambda: stream.read(_READ), b"")
-                packed = start.startswith(GZIP_MAGIC) or start == ZSTD_MAGIC
-                yield from self._unpacked(blocks, zstd=start == ZSTD_MAGIC) if packed else blocks
-        except OSError as error:
-            raise unreadable(self.path, error) from error
-
-    def _unpacked(self, blocks: Iterable[bytes], *, zstd: bool) -> Iterator[bytes]:
-        member = _member(zstd=zstd)
-        for block in blocks:
-            rest = block
-            while rest:
-                if member.eof:
-                    if not rest.strip(b"\0"):
-                        break
-                    member = _member(zstd=zstd)
-                with decoding(self.path, "its packed content"):
-                    plain = member.decompress(rest)
-                rest = member.unused_data if member.eof else b""
-                yield plain
-        self.cut = not member.eof
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
 
 
-def _member(*, zstd: bool) -> Any:
-    if zstd:
-        import zstandard
+def _mask(stretches: Sequence[tuple[int, int]], size: int) -> NDArray[np.bool_] | None:
+    if not stretches:
+        return None
+    mask = np.zeros(size, dtype=np.bool_)
+    for first, stop in stretches:
+        mask[first:stop] = True
+    return mask
 
-        return zstandard.ZstdDecompressor().decompressobj()
-    return zlib.decompressobj(wbits=31)
+
+class _Column:
+    """The samples of one column of all files, in one buffer: integers until some block holds other numbers."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._integers = True
+        self._buffer: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+
+    def reserve(self, size: int) -> None:
+        """Make room for ``size`` samples in all; room that is never used takes no memory."""
+        if size > self._buffer.size:
+            grown = np.empty(size, dtype=np.int64)
+            grown[: self.size] = self._buffer[: self.size]
+            self._buffer = grown
+
+    def extend(self, values: NDArray[Any]) -> None:
+        """Append one block."""
+        if self._integers and values.size and values.dtype.kind != "i":
+            self._become_floats()
+        stop = self.size + values.size
+        if stop > self._buffer.size:
+            self.reserve(max(stop, self._buffer.size + self._buffer.size // 2))
+        target = self._buffer if self._integers else self._buffer.view(np.float64)
+        target[self.size : stop] = values
+        self.size = stop
+
+    def _become_floats(self) -> None:
+        floats = self._buffer.view(np.float64)
+        for start in range(0, self.size, _SPLICE):
+            part = slice(start, min(start + _SPLICE, self.size))
+            floats[part] = self._buffer[part].astype(np.float64)
+        self._integers = False
+
+    def channel(
+        self,
+        name: str,
+        unit: str | None,
+        good: NDArray[np.bool_] | None,
+        suspect: NDArray[np.bool_] | None,
+    ) -> RawChannel:
+        """Return the samples that are ``good`` (None: all)."""
+        exact = None
+        if self._integers:
+            integers = self._buffer[: self.size]
+            if needs_integers(integers):
+                exact = integers.copy() if good is None else integers[good]
+            self._become_floats()
+        values = self._buffer.view(np.float64)[: self.size]
+        return RawChannel(name, values if good is None else values[good], {}, unit, exact, suspect)
 
 
 @dataclass
-class _Table:
-    """One file, its dialect, and what was noticed while reading it."""
+class _Account:
+    """What was met in one file, while it is read."""
 
     path: Path
-    options: Options
-    notes: list[Note] = field(default_factory=list)
+    line: int
+    rows: int = 0
+    bad: int = 0
+    lost: int | None = 0
+    lost_bytes: int = 0
+    suspect: list[tuple[int, int]] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+    first: InputError | None = None
+    _stops: list[tuple[int, int, int]] = field(default_factory=list)
+    _excused: int = 0  # bad lines where the packing is damaged: they say nothing about the rest
 
-    def __post_init__(self) -> None:
-        head = _Bytes(self.path).head()
+    def take(self, rows: Rows, stop: int) -> None:
+        """Count a block that ends at byte ``stop`` of the text."""
+        for one in rows.bad:
+            self._tell(f"{self.path}:{self.line + one.place}: {one.words}", one.hint, bad=True)
+        self.lose(len(rows.bad) if not rows.holes else None, rows.holes)
+        self.line += rows.lines
+        self.rows += rows.count
+        self._stops.append((stop, self.rows, self.bad))
+
+    def fault(self, fault: Fault, stop: int) -> None:
+        """Count what is lost at a fault at byte ``stop`` of the text, and doubt what comes before."""
+        place = f":{self.line}" if fault.at_line else ""
+        self._tell(f"{self.path}{place}: {fault.words}", CURE)
+        self.lose(fault.lost, fault.lost_bytes)
+        if fault.doubt:
+            before = [(rows, bad) for end, rows, bad in self._stops if end <= stop - fault.doubt]
+            rows, bad = before[-1] if before else (0, 0)
+            self.suspect.append((rows, self.rows))
+            self._excused += self.bad - bad
+
+    def lose(self, lines: int | None, count: int) -> None:
+        self.lost = None if lines is None or self.lost is None else self.lost + lines
+        self.lost_bytes += count
+
+    def _tell(self, words: str, hint: str, *, bad: bool = False) -> None:
+        self.bad += bad
+        if not bad or self.bad <= _TOLD:
+            self.reasons.append(words)
+        self.first = self.first or InputError(words, hint)
+
+    def refuse(self, *, strict: bool, end: bool = False) -> None:
+        """Raise the first thing that was wrong where ``strict``, or where most likely the table is no such."""
+        bad = self.bad - self._excused
+        many = bad > _MOST_BAD * (bad + self.rows) and (end or bad > _SOON)
+        if self.first is not None and (strict or many):
+            raise self.first
+
+    def damage(self) -> Damage:
+        """Return the account."""
+        reasons = list(self.reasons)
+        if self.bad > _TOLD:
+            reasons.append(f"{self.path}: {self.bad - _TOLD} more lines cannot be read")
+        mask = _mask(self.suspect, self.rows)
+        suspect = 0 if mask is None else int(np.count_nonzero(mask))
+        return Damage(
+            self.path,
+            trusted=self.rows - suspect,
+            suspect=suspect,
+            lost=self.lost,
+            lost_bytes=self.lost_bytes,
+            reasons=tuple(reasons),
+        )
+
+
+class _Table:
+    """One file and its dialect."""
+
+    def __init__(self, path: Path, options: Options) -> None:
+        self.path = path
+        self.options = options
+        head = _head(path)
         if not head:
-            raise InputError(f"{self.path} is empty", "check that the log was written")
-        lines, self._encoding = _first_lines(head, self.options, self.path)
-        self.dialect: Dialect = detect(lines, self.options, name=str(self.path))
-        self._recent: deque[str] = deque(maxlen=20)
+            raise InputError(f"{path} is empty", "check that the log was written")
+        lines, self._encoding = _first_lines(head, options, path)
+        self.dialect: Dialect = detect(lines, options, name=str(path))
+        self._line_bytes = len(head) / max(1, head.count(b"\n"))
+        self._returns = b"\r" in head
+        self._raw = is_like_ascii(self._encoding)
 
     def place(self, source: str | int) -> int:
         """Return the place of a column, from 0, by name, by the header's text, or by number from 1."""
@@ -230,187 +335,79 @@ class _Table:
         detail = "" if self.dialect.header else ", for it has no header"
         raise missing_channel(text, list(dict.fromkeys(known)), log=str(self.path), detail=detail)
 
-    def blocks(self) -> Iterator[_Block]:
-        """Yield the samples as blocks of lines whose number of fields is checked.
+    def count(self) -> int:
+        """Count the samples: the lines that have all fields."""
+        account = _Account(self.path, self.dialect.first_line)
+        with closing(self._rows((), account, None, _ignore)) as blocks:
+            for _ in blocks:
+                account.refuse(strict=False)
+        account.refuse(strict=False, end=True)
+        return account.rows
 
-        Raises
-        ------
-        InputError
-            A line has too few or too many fields, or the text cannot be decoded.
-        """
-        self.notes.clear()
-        source = _Bytes(self.path)
-        rest, number = "", 1
-        for text in self._texts(source):
-            rest += text
-            end = rest.rfind("\n") + 1
-            if end >= _BLOCK:
-                block = self._block(rest[:end], number)
-                number, rest = number + rest.count("\n", 0, end), rest[end:]
-                if block.rows:
-                    yield block
-        end = rest.rfind("\n") + 1
-        block = self._block(rest[:end], number)
-        last = self._last(rest[end:], number + rest.count("\n", 0, end), cut=source.cut)
-        if block.rows or last:
-            lines = [*block.lines, last[0]] if last else block.lines
-            yield _Block(block.text + (last[1] if last else ""), block.rows + bool(last), lines)
+    def read(
+        self,
+        columns: dict[int, _Column],
+        suspect: list[tuple[int, int]],
+        options: ReadOptions,
+        progress: Progress,
+    ) -> Damage:
+        """Append the samples to ``columns`` and the stretches that may be wrong to ``suspect``."""
+        account = _Account(self.path, self.dialect.first_line)
+        offset = next(iter(columns.values())).size if columns else 0
+        expected = offset + int(1.02 * _size(self.path) / self._line_bytes) + 64
+        import pandas  # noqa: F401, ICN001 - here, for threads must not import it at the same time
 
-    def _texts(self, source: _Bytes) -> Iterator[str]:
-        decoder = io.IncrementalNewlineDecoder(codecs.getincrementaldecoder(self._encoding)(), translate=True)
-        for block in source:
-            yield self._decode(decoder, block, final=False)
-        if not source.cut:
-            yield self._decode(decoder, b"", final=True)
+        with closing(self._rows(tuple(columns), account, options.threads, progress.advance)) as blocks:
+            for rows in blocks:
+                account.refuse(strict=options.strict)
+                for place, values in rows.columns.items():
+                    columns[place].reserve(expected)
+                    columns[place].extend(values)
+        account.refuse(strict=options.strict, end=True)
+        suspect += [(first + offset, stop + offset) for first, stop in account.suspect]
+        return account.damage()
 
-    def _decode(self, decoder: io.IncrementalNewlineDecoder, block: bytes, *, final: bool) -> str:
-        try:
-            return decoder.decode(block, final=final)
-        except UnicodeDecodeError as error:
-            raise InputError(
-                f"{self.path} is not written in {self._encoding}: {error.reason}",
-                "name its encoding: `csv: {encoding: latin-1}`",
-            ) from error
+    def _rows(
+        self, wanted: tuple[int, ...], account: _Account, threads: int | None, advance: Callable[[int], None]
+    ) -> Generator[Rows]:
+        """Parse block by block in threads, in the order of the file, and keep account."""
+        encoding = self._encoding.removesuffix("-sig") if self._raw else "utf-8"
+        parse = RowReader(self.dialect, encoding, wanted)
+        stop = 0
+        with closing(in_order(parse, self._blocks(advance), threads or os.cpu_count() or 1)) as items:
+            for item in items:
+                if isinstance(item, Fault):
+                    account.fault(item, stop)
+                else:
+                    rows, stop = item
+                    account.take(rows, stop)
+                    yield rows
 
-    def _block(self, text: str, number: int) -> _Block:
-        """Keep the samples of whole lines, the first of which is line ``number`` of the file."""
-        width, delimiter = len(self.dialect.fields), self.dialect.delimiter
-        count = text.count("\n")
-        plain = number >= self.dialect.first_line and delimiter != WHITESPACE
-        odd = ('"', *self.dialect.comments)
-        if plain and not any(mark in text for mark in odd) and _is_even(text, delimiter, width):
-            self._remember(text)
-            return _Block(text, count, range(number, number + count))
-        kept, lines = [], []
-        for place, line in enumerate(text.split("\n")[:-1], start=number):
-            if place < self.dialect.first_line or not line.strip():
+    def _blocks(self, advance: Callable[[int], None]) -> Iterator[Block | Fault]:
+        """Cut the text below the header into blocks of whole lines."""
+        cutter = Cutter(self.dialect)
+        for piece in unified(pieces(self.path, advance), self._encoding, returns=self._returns):
+            yield from cutter.fault(piece) if isinstance(piece, Fault) else cutter.feed(piece)
+        yield from cutter.end()
+
+
+def _ignore(_count: int) -> None:
+    """Take no notice of progress."""
+
+
+def _head(path: Path) -> bytes:
+    """Return the first bytes of the text, up to a place where something is lost."""
+    head = b""
+    with closing(pieces(path, _ignore)) as blocks:
+        for block in blocks:
+            if isinstance(block, Fault):
+                if block.lost is None:
+                    break
                 continue
-            if line.lstrip().startswith(self.dialect.comments):
-                continue
-            self._check_width(line, place)
-            kept.append(line)
-            lines.append(place)
-        joined = "\n".join(kept) + "\n" if kept else ""
-        self._remember(joined)
-        return _Block(joined, len(kept), lines)
-
-    def _check_width(self, line: str, number: int) -> None:
-        width = len(self.dialect.fields)
-        found = len(split_line(line, self.dialect.delimiter))
-        if found != width:
-            raise InputError(
-                f"{self.path}:{number}: the line has {found} fields, not {width}: {line.strip()[:60]!r}",
-                "correct or remove the line; the file may be two recordings in one, or damaged",
-            )
-
-    def _remember(self, text: str) -> None:
-        tail = text[-4096:].split("\n")[-21:-1]
-        self._recent.extend(split_line(line, self.dialect.delimiter)[-1] for line in tail)
-
-    def _last(self, line: str, number: int, *, cut: bool) -> tuple[int, str] | None:
-        """Return the last line, which has no line end, if it is surely whole; else note its loss."""
-        if not line.strip() or line.lstrip().startswith(self.dialect.comments):
-            if cut:
-                self.notes.append(Note(f"{self.path} is cut short; what comes before was read"))
-            return None
-        cells = split_line(line, self.dialect.delimiter)
-        whole = len(cells) == len(self.dialect.fields)
-        sure = whole and is_whole(cells[-1], list(self._recent), self.dialect.decimal)
-        if sure and not cut and number >= self.dialect.first_line:
-            return number, f"{line}\n"
-        why = "the file is cut short" if cut else "it has no line end"
-        self.notes.append(
-            Note(f"{self.path}:{number}: the last line was dropped, for {why} and it may be cut")
-        )
-        return None
-
-    def numbers(self, block: _Block, wanted: Sequence[int]) -> dict[int, NDArray[Any]]:
-        """Parse columns of a block: int64 arrays where all are integers, else float64."""
-        frame = self._frame(block, wanted)
-        columns = {place: self._column(frame[place], place, block) for place in wanted}
-        signed = "-0" in block.text
-        zeros = [
-            place
-            for place, values in columns.items()
-            if signed and values.dtype.kind == "i" and not values.all()
-        ]
-        if zeros:  # an integer has no negative zero
-            again = self._frame(block, zeros, dtype="float64")
-            columns.update({place: again[place].to_numpy() for place in zeros})
-        return columns
-
-    def _frame(self, block: _Block, wanted: Sequence[int], **how: Any) -> pd.DataFrame:
-        import pandas as pd
-
-        delimiter = self.dialect.delimiter
-        try:
-            frame: pd.DataFrame = pd.read_csv(
-                io.StringIO(block.text),
-                sep=r"\s+" if delimiter == WHITESPACE else delimiter,
-                decimal=self.dialect.decimal,
-                header=None,
-                names=list(range(len(self.dialect.fields))),
-                index_col=False,
-                usecols=list(wanted),
-                na_values=list(MISSING),
-                keep_default_na=False,
-                skipinitialspace=True,
-                low_memory=False,
-                **_exact_floats(),
-                **how,
-            )
-        except (pd.errors.ParserError, ValueError) as error:
-            for line, number in zip(block.text.split("\n"), block.lines, strict=False):
-                self._check_width(line, number)
-            raise InputError(f"{self.path} cannot be read as a table ({error})") from error
-        return frame
-
-    def _column(self, series: pd.Series[Any], place: int, block: _Block) -> NDArray[Any]:
-        if series.dtype.kind in "if":
-            return series.to_numpy()
-        if series.dtype.kind in "bu":
-            return series.to_numpy().astype(np.float64)
-        values = np.empty(len(series))
-        for row, value in enumerate(series.tolist()):
-            values[row] = self._number(value, place, row, block)
-        return values
-
-    def _number(self, value: Any, place: int, row: int, block: _Block) -> float:
-        if not isinstance(value, str):
-            return float("nan") if value is None else float(value)
-        if is_missing(value):
-            return float("nan")
-        if is_number(value, self.dialect.decimal):
-            truth = {"true": 1.0, "false": 0.0}.get(value.strip().lower())
-            return float(value.replace(self.dialect.decimal, ".")) if truth is None else truth
-        name = self.dialect.fields[place].name
-        mark = "decimal comma" if self.dialect.decimal == "," else "decimal point"
-        raise InputError(
-            f"{self.path}:{block.lines[row]}: column {name!r} has the text {value[:40]!r}, not a number",
-            f"correct the line, or leave the field empty; numbers are read with a {mark}, which "
-            "`csv: {decimal: ...}` sets",
-        )
-
-
-def _is_even(text: str, delimiter: str, width: int) -> bool:
-    """Whether each line has exactly ``width`` fields, and none is blank."""
-    marks = np.frombuffer(text.encode(), dtype=np.uint8)
-    ends = marks == ord("\n")
-    if width == 1 or ord(delimiter) > 127:
-        return False
-    marks = marks[ends | (marks == ord(delimiter))]
-    if marks.size % width:
-        return False
-    lines = marks.reshape(-1, width) == ord("\n")
-    return bool(lines[:, -1].all()) and not lines[:, :-1].any()
-
-
-def _exact_floats() -> Mapping[str, Any]:
-    """Ask for correctly rounded numbers where that is not the parser's only way."""
-    import pandas as pd
-
-    major, minor = (int(part) for part in pd.__version__.split(".")[:2])
-    return {} if (major, minor) >= (3, 1) else {"float_precision": "round_trip"}
+            head += block
+            if len(head) >= _HEAD:
+                break
+    return head[:_HEAD]
 
 
 def _first_lines(head: bytes, options: Options, path: Path) -> tuple[list[str], str]:
@@ -419,7 +416,7 @@ def _first_lines(head: bytes, options: Options, path: Path) -> tuple[list[str], 
     if encoding is None:
         raise InputError(f"{path} is no text", "flexid reads CSV, MCAP, rosbag2 and ROS 1 bags")
     try:
-        decoder = codecs.getincrementaldecoder(encoding)()
+        decoder = codecs.getincrementaldecoder(encoding)(errors="strict" if options.encoding else "replace")
         text = io.IncrementalNewlineDecoder(decoder, translate=True).decode(head)
     except (LookupError, UnicodeDecodeError) as error:
         raise InputError(
@@ -442,12 +439,3 @@ def _is_table(lines: Sequence[str], dialect: Dialect) -> bool:
 
 def _aliases(name: str, text: str, place: int) -> tuple[str, ...]:
     return tuple(dict.fromkeys(other for other in (text, str(place)) if other != name))
-
-
-def _channel(name: str, unit: str | None, parts: Sequence[NDArray[Any]]) -> RawChannel:
-    values = np.concatenate([part.astype(np.float64) for part in parts]) if parts else np.empty(0)
-    exact = None
-    if parts and all(part.dtype.kind == "i" for part in parts):
-        integers = np.concatenate([part.astype(np.int64) for part in parts])
-        exact = integers if needs_integers(integers) else None
-    return RawChannel(name, values, {}, unit, exact)

@@ -18,7 +18,8 @@ def damaged(path: Path, detail: str) -> InputError:
 
 
 @cache
-def _failures() -> tuple[type[Exception], ...]:
+def failures() -> tuple[type[Exception], ...]:
+    """Return the exceptions by which the libraries say that bytes are not what they should be."""
     import sqlite3
     import struct
     import zlib
@@ -51,7 +52,7 @@ def decoding(path: Path, what: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise unreadable(path, error) from error
-    except _failures() as error:
+    except failures() as error:
         raise damaged(path, f"{what} cannot be read ({explain(error)})") from error
 
 

@@ -85,12 +85,13 @@ def _cdr_decoder(kind: TopicType) -> Decoder:
 
     def decode(data: bytes) -> Any:
         # a bag compressed message by message; no CDR header begins with these bytes
-        return store.deserialize_cdr(_inflate(data) if data[:4] == ZSTD_MAGIC else data, name)
+        return store.deserialize_cdr(inflate(data) if data[:4] == ZSTD_MAGIC else data, name)
 
     return decode
 
 
-def _inflate(data: bytes) -> bytes:
+def inflate(data: bytes) -> bytes:
+    """Unpack one zstd frame; raises EOFError where it is cut short."""
     import zstandard
 
     frame = zstandard.ZstdDecompressor().decompressobj()
@@ -106,6 +107,12 @@ def _ros1_decoder(kind: TopicType) -> Decoder:
     return lambda data: store.deserialize_ros1(data, name)
 
 
+def type_fields(kind: TopicType) -> tuple[Typesdict, str]:
+    """Return the definitions of a CDR or ROS 1 topic's types, and the name of its own; raises as `make_decoder`."""
+    return _store(kind).fielddefs, full_name(kind.msgtype)
+
+
+@lru_cache(maxsize=64)
 def _store(kind: TopicType) -> Typestore:
     """Return a type store of its own for each schema, so that two versions of a type do not collide."""
     from rosbags.typesys import Stores, get_typestore

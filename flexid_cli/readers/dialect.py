@@ -26,6 +26,7 @@ _NUMBER = {
 }
 _UNIT_IN_NAME = re.compile(r"^(?P<name>.*\S)\s*(?:\[(?P<square>[^\[\]]*)\]|\((?P<round>[^()]*)\))$")
 _LOOKED_AT = 400  # lines
+_ODD_SHARE = 1e-3  # of characters that no text has: more of them is no damage, but no text
 
 
 class Options(Protocol):
@@ -120,8 +121,9 @@ def detect_encoding(head: bytes, *, whole: bool) -> str | None:
         if head.startswith(mark):
             return name
     if b"\0" in head:
-        return _unmarked_utf16(head)
-    if any(byte < 9 or (13 < byte < 32 and byte != 26) for byte in head[:4096]):
+        return _unmarked_utf16(head) or _around_holes(head, whole=whole)
+    odd = sum(byte < 9 or (13 < byte < 32 and byte != 26) for byte in head[:4096])
+    if odd > _ODD_SHARE * min(len(head), 4096):
         return None
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head, final=whole)
@@ -136,6 +138,16 @@ def _decodes(head: bytes, encoding: str) -> bool:
     except UnicodeDecodeError:
         return False
     return True
+
+
+def _around_holes(head: bytes, *, whole: bool) -> str | None:
+    """Return the encoding of a text with stretches of zero bytes, which a loss of power leaves in files."""
+    holes = len(re.findall(rb"\0+", head))
+    text = head.replace(b"\0", b"")
+    first, end, _ = head.partition(b"\n")
+    if not end or b"\0" in first or holes > 1 + _ODD_SHARE * len(text):
+        return None
+    return detect_encoding(text, whole=whole)
 
 
 def _unmarked_utf16(head: bytes) -> str | None:

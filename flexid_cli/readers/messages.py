@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import keyword
-from array import array
 from collections.abc import Iterator, Sequence
 from numbers import Integral, Real
 from typing import Any, Final
@@ -15,10 +14,11 @@ from numpy.typing import NDArray
 from flexid_cli.errors import InputError
 from flexid_cli.readers.path import Leaf, Step, canonical
 
+LARGEST_EXACT = 2**53  # every integer up to here is a float64
 LONGEST_ARRAY = 1024  # elements; longer ones are images and scans, not signals of a drive
 _NAME_FIELDS = ("name", "names", "joint_names")
-_STAMP_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
-_STAMP_PLACES: tuple[tuple[Step, ...], ...] = (("header", "stamp"), ("stamp",), ("timestamp",))
+STAMP_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
+STAMP_PLACES: tuple[tuple[Step, ...], ...] = (("header", "stamp"), ("stamp",), ("timestamp",))
 
 
 class _Missing:
@@ -55,21 +55,29 @@ def stamp_ns(message: Any) -> int | None:
     Looked for are ``header.stamp``, ``stamp`` and ``timestamp``, as seconds and nanoseconds in the spellings
     of ROS 1, ROS 2, Foxglove's JSON schemas and ``google.protobuf.Timestamp``.
     """
-    for place in _STAMP_PLACES:
-        seconds, nanoseconds = _stamp_parts(follow(message, place))
-        if seconds is not None and nanoseconds is not None:
-            return int(seconds) * 1_000_000_000 + int(nanoseconds)
+    steps = stamp_steps(message)
+    if steps is None:
+        return None
+    seconds, nanoseconds = (follow(message, part) for part in steps)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def stamp_steps(message: Any) -> tuple[tuple[Step, ...], tuple[Step, ...]] | None:
+    """Return the steps to the seconds and the nanoseconds of the message's own stamp, or None."""
+    for place in STAMP_PLACES:
+        fields = _stamp_fields(follow(message, place))
+        if fields is not None:
+            return (*place, fields[0]), (*place, fields[1])
     return None
 
 
-def _stamp_parts(node: Any) -> tuple[int | None, int | None]:
+def _stamp_fields(node: Any) -> tuple[str, str] | None:
     if node is MISSING or node is None or isinstance(node, str | bytes):
-        return None, None
-    for coarse, fine in _STAMP_FIELDS:
-        seconds, nanoseconds = child(node, coarse), child(node, fine)
-        if isinstance(seconds, Integral) and isinstance(nanoseconds, Integral):
-            return int(seconds), int(nanoseconds)
-    return None, None
+        return None
+    for coarse, fine in STAMP_FIELDS:
+        if isinstance(child(node, coarse), Integral) and isinstance(child(node, fine), Integral):
+            return coarse, fine
+    return None
 
 
 def leaves_of(topic: str, message: Any) -> Iterator[Leaf]:
@@ -92,7 +100,7 @@ def _walk(
                 yield Leaf(topic, (*steps, place), named[1][place], named[0])
             else:
                 yield Leaf(topic, (*steps, place))
-    elif _stamp_parts(node) == (None, None):
+    elif _stamp_fields(node) is None:
         fields = _fields(node)
         named = _names(fields, steps) or named
         for name, value in fields.items():
@@ -137,63 +145,60 @@ def _is_array(node: Any) -> bool:
     return hasattr(node, "__len__") and hasattr(node, "__getitem__")
 
 
-class Column:
-    """The samples of one channel, gathered message by message.
+class Picker:
+    """Finds one channel's number in decoded messages.
 
     Parameters
     ----------
     leaf : Leaf
         Where the number stands.
+    named : dict, optional
+        Name that stands at the place of each leaf that has a place but no name; shared by all pickers of one
+        recording, so that a change of names between two files is noticed too.
     """
 
-    def __init__(self, leaf: Leaf) -> None:
+    def __init__(self, leaf: Leaf, named: dict[Leaf, str] | None = None) -> None:
         self.leaf = leaf
-        self._values = array("d")
-        self._rows = array("q")
-        self._integers: array[int] | None = array("q")
+        self._named = {} if named is None else named
         self._known_names: Any = None
         self._place: int | None = None
 
-    def take(self, message: Any, row: int) -> None:
-        """Take this channel's number out of ``message``, the ``row``-th of its topic.
+    def pick(self, message: Any) -> Any:
+        """Return the number, None for a null, or MISSING.
 
         Raises
         ------
         InputError
             A text stands where a number is expected, or names and numbers do not match.
         """
-        value = self._pick(message)
-        if value is MISSING:
-            return
-        if isinstance(value, float):  # a numpy float64 is one too
-            self._integers = None
-        elif value is None:
-            self._integers, value = None, float("nan")
-        elif isinstance(value, Integral) and not isinstance(value, bool | np.bool_):
-            self._keep_integer(int(value))
-        elif _is_number(value):
-            self._integers = None
-        else:
-            raise InputError(
-                f"channel {canonical(self.leaf)!r}: message {row + 1} of its topic has {str(value)[:40]!r} "
-                "where a number is expected"
-            )
-        self._values.append(float(value))
-        self._rows.append(row)
+        steps = self.steps(message)
+        value = MISSING if steps is None else follow(message, steps)
+        if value is MISSING or value is None or _is_number(value):
+            return value
+        raise InputError(
+            f"channel {canonical(self.leaf)!r}: a message has {str(value)[:40]!r} where a number is expected"
+        )
 
-    def _pick(self, message: Any) -> Any:
+    def steps(self, message: Any) -> tuple[Step, ...] | None:
+        """Return the steps to the number in ``message``, or None where an array of names says it lacks it.
+
+        Raises
+        ------
+        InputError
+            Names and numbers do not match.
+        """
         leaf = self.leaf
         if leaf.names is None:
-            return follow(message, leaf.steps)
+            return leaf.steps
         numbers = follow(message, leaf.steps[:-1])
-        if numbers is MISSING or len(numbers) == 0:
-            return MISSING
+        if not _is_array(numbers) or len(numbers) == 0:
+            return None
         place = self._named_place(follow(message, leaf.names), len(numbers))
-        return MISSING if place is None else numbers[place]
+        return None if place is None else (*leaf.steps[:-1], place)
 
     def _named_place(self, names: Any, length: int) -> int | None:
         """Place of this channel's joint in a message with ``names`` and as many numbers."""
-        if names is MISSING or len(names) == 0:
+        if not _is_array(names) or len(names) == 0:
             names = []
         if names != self._known_names:
             self._place = self._find_place(list(names), length)
@@ -217,8 +222,8 @@ class Column:
         place = int(leaf.steps[-1])
         if not -length <= place < length:
             return None
-        if names and self._known_names and self._place is not None:
-            before, now = self._known_names[self._place], names[place] if len(names) == length else ""
+        if len(names) == length:
+            before, now = self._named.setdefault(leaf, names[place]), names[place]
             if before != now:
                 raise InputError(
                     f"channel {canonical(leaf)!r} is {before!r} in some messages and {now!r} in others",
@@ -226,31 +231,10 @@ class Column:
                 )
         return place
 
-    def _keep_integer(self, value: int) -> None:
-        if self._integers is None:
-            return
-        if -(2**63) <= value < 2**63:
-            self._integers.append(value)
-        else:
-            self._integers = None
-
-    @property
-    def values(self) -> NDArray[np.float64]:
-        """Samples, shape (n,)."""
-        return np.array(self._values, dtype=np.float64)
-
-    @property
-    def rows(self) -> NDArray[np.int64]:
-        """Number of each sample's message within its topic, shape (n,)."""
-        return np.array(self._rows, dtype=np.int64)
-
-    @property
-    def integers(self) -> NDArray[np.int64] | None:
-        """The samples as integers, shape (n,), where all of them are."""
-        return None if self._integers is None else np.array(self._integers, dtype=np.int64)
-
 
 def needs_integers(integers: NDArray[np.int64]) -> bool:
     """Whether float64 cannot hold every one of ``integers``."""
-    large = integers[np.abs(integers.astype(np.float64)) > 2.0**53]
-    return any(int(float(value)) != value for value in large.tolist())
+    large = integers[(integers > LARGEST_EXACT) | (integers < -LARGEST_EXACT)]
+    rounded = large.astype(np.float64)
+    beyond = rounded >= 2.0**63  # the largest integers round up to a number that int64 does not have
+    return bool(np.any(beyond) or np.any(rounded.astype(np.int64) != large))

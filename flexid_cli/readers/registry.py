@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexid_cli.errors import InputError
-from flexid_cli.readers.base import HEAD_BYTES, ChannelInfo, RawLog, Reader
+from flexid_cli.readers.base import DEFAULT_OPTIONS, HEAD_BYTES, ChannelInfo, RawLog, Reader, ReadOptions
 from flexid_cli.readers.damage import unreadable
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ def read_log(
     sources: Sequence[str | int],
     csv: CsvOptions | None = None,
     time_source: str | int | None = None,
+    options: ReadOptions = DEFAULT_OPTIONS,
 ) -> RawLog:
     """Read channels of a log.
 
@@ -77,6 +78,8 @@ def read_log(
     time_source : str or int, optional
         ``header_stamp``, ``log_time`` or ``publish_time``: every channel must have that clock. Anything else
         is a channel that holds the time and is read with the others.
+    options : ReadOptions
+        The window, and what is done with damage.
 
     Returns
     -------
@@ -86,14 +89,15 @@ def read_log(
     Raises
     ------
     InputError
-        The log cannot be read, or a channel or clock is missing.
+        The log cannot be read, a channel or clock is missing, nothing lies in the window, or the log is damaged
+        and the options are strict.
     """
     reader = open_reader(paths, csv)
     is_clock = reader.name != "csv" and time_source in {"header_stamp", "log_time", "publish_time"}
     wanted = list(dict.fromkeys(sources))
     if time_source is not None and not is_clock and time_source not in wanted:
         wanted.append(time_source)
-    log = reader.read(paths, wanted)  # type: ignore[arg-type]
+    log = reader.read(paths, wanted, options)  # type: ignore[arg-type]
     if is_clock:
         _check_clock(log, str(time_source))
     return replace(log, channels=dict(log.channels))

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import re
 import shutil
-import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Any
-from urllib.parse import quote
 
 from flexid_cli.errors import InputError
-from flexid_cli.readers.base import HEAD_BYTES, Note
-from flexid_cli.readers.container import Container, Message, MessageReader, Probe
-from flexid_cli.readers.damage import damaged, decoding, unreadable
-from flexid_cli.readers.decoders import ZSTD_MAGIC, TopicType
-from flexid_cli.readers.mcap import MAGIC as MCAP_MAGIC
-from flexid_cli.readers.mcap import McapFile
+from flexid_cli.readers.base import DEFAULT_OPTIONS, HEAD_BYTES, Note, Progress, ReadOptions
+from flexid_cli.readers.container import Container, MessageReader
+from flexid_cli.readers.damage import damaged, decoding, explain, unreadable
+from flexid_cli.readers.decoders import ZSTD_MAGIC
+from flexid_cli.readers.mcap import McapFile, McapReader
+from flexid_cli.readers.mcap_records import MAGIC as MCAP_MAGIC
+from flexid_cli.readers.sqlite_storage import SqliteFile
+from flexid_cli.readers.wal import close_recording
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
 METADATA = "metadata.yaml"
+_PACKED_BYTES = 1 << 18
+_PAGE = 4096
 _STORAGE = re.compile(r"\.(db3|mcap)(\.zstd|\.zst)?$")
 
 
@@ -35,18 +37,24 @@ class Rosbag2Reader(MessageReader):
         """Whether ``path`` is a folder with a bag, an sqlite3 file, or a compressed storage file."""
         if path.is_dir():
             return (path / METADATA).is_file() or bool(_storage_files(path))
-        return head.startswith(SQLITE_MAGIC) or is_packed_storage(head)
+        if head.startswith(SQLITE_MAGIC) or is_packed_storage(head):
+            return True
+        # a database whose first page is destroyed can still be read; a table of text is none
+        return path.suffix == ".db3" and not head.startswith(MCAP_MAGIC) and b"\x00" in head[:_PAGE]
 
     @contextmanager
-    def open_files(self, paths: Sequence[Path]) -> Iterator[tuple[list[Container], list[Note]]]:
+    def open_files(
+        self, paths: Sequence[Path], options: ReadOptions = DEFAULT_OPTIONS
+    ) -> Iterator[tuple[list[Container], list[Note]]]:
         """Open all storage files of one run."""
         notes: list[Note] = []
         with ExitStack() as stack:
-            files: list[Container] = []
+            members: list[Path] = []
             for path in paths:
-                members = _members(path, notes) if path.is_dir() else [path]
-                files += [_open_storage(stack, member) for member in members]
-            yield files, notes
+                members += _members(path, notes) if path.is_dir() else [path]
+            sizes = [path.stat().st_size for path in members if path.exists()]
+            progress = Progress(options, sum(sizes))
+            yield [_open_storage(stack, member, options, progress) for member in members], notes
 
 
 def is_packed_storage(head: bytes) -> bool:
@@ -120,143 +128,84 @@ def _check_format(metadata: Path, information: dict[str, Any]) -> None:
         raise InputError(f"{metadata}: flexid does not read the compression {packing!r}", "use zstd")
 
 
-def _open_storage(stack: ExitStack, path: Path) -> Container:
+def _open_storage(stack: ExitStack, path: Path, options: ReadOptions, progress: Progress) -> Container:
     try:
         with path.open("rb") as stream:
             head = stream.read(HEAD_BYTES)
     except OSError as error:
         raise unreadable(path, error) from error
-    file = path
+    file, cut = path, None
     if head.startswith(ZSTD_MAGIC):
-        file = Path(stack.enter_context(TemporaryDirectory(prefix="flexid-"))) / "storage"
-        head = _unpack(path, file)
-    if head.startswith(MCAP_MAGIC):
-        return McapFile(file, path)
-    if head.startswith(SQLITE_MAGIC):
-        return stack.enter_context(_opened(file, path))
+        file = _temporary(stack) / "storage"
+        cut = _unpack(path, file)
+        head = _head(file)
     if not head:
         raise InputError(f"{path} is empty", "its recorder was killed before it wrote anything")
-    raise damaged(path, "it begins neither as an sqlite3 nor as an MCAP file")
+    if McapReader().sniff(path, head):
+        storage = McapFile(file, path, options, progress)
+        storage.notes += [] if cut is None else [Note(cut)]
+        return storage
+    if not head.startswith(SQLITE_MAGIC) and ".db3" not in path.suffixes:
+        raise damaged(path, "it begins neither as an sqlite3 nor as an MCAP file")
+    return _open_sqlite(stack, file, path, progress, cut)
 
 
-def _unpack(path: Path, file: Path) -> bytes:
-    """Decompress ``path`` into ``file`` and return its first bytes."""
+def _head(file: Path) -> bytes:
+    with file.open("rb") as stream:
+        return stream.read(HEAD_BYTES)
+
+
+def _temporary(stack: ExitStack) -> Path:
+    return Path(stack.enter_context(TemporaryDirectory(prefix="flexid-")))
+
+
+def _unpack(path: Path, file: Path) -> str | None:
+    """Decompress ``path`` into ``file`` as far as it goes, and say where that ends if not at its end."""
     import zstandard
 
-    with decoding(path, "its zstd stream"), path.open("rb") as packed, file.open("wb") as plain:
-        frame = zstandard.ZstdDecompressor().decompressobj()
-        while block := packed.read(1 << 20):
-            plain.write(frame.decompress(block))
-            if frame.eof:
-                break
-        if not frame.eof:
-            raise EOFError("it is cut short")
-    with file.open("rb") as plain:
-        return plain.read(HEAD_BYTES)
+    frame = zstandard.ZstdDecompressor().decompressobj()
+    done = 0
+    with path.open("rb") as packed, file.open("wb") as plain:
+        while not frame.eof:
+            block = packed.read(_PACKED_BYTES)
+            if not block:
+                return f"{path} is cut short: its zstd stream ends at byte {done} without its end"
+            try:
+                plain.write(frame.decompress(block))
+            except zstandard.ZstdError as error:
+                return (
+                    f"{path} is damaged: its zstd stream cannot be read beyond byte {done} ({explain(error)})"
+                )
+            done += len(block)
+    return None
 
 
-@contextmanager
-def _opened(file: Path, shown: Path) -> Iterator[Container]:
+def _open_sqlite(stack: ExitStack, file: Path, shown: Path, progress: Progress, cut: str | None) -> Container:
     """Open an sqlite3 storage without writing beside it.
 
     A recorder that was killed leaves its last messages in a ``-wal`` file (or an unfinished transaction in a
-    ``-journal``), which SQLite takes into account only when it may write beside the database: then a copy is
-    opened.
+    ``-journal``), which SQLite takes in only where it may write: so a copy is made, and closed by it.
     """
     left = [
         side
         for end in ("-wal", "-journal")
         if (side := Path(f"{file}{end}")).exists() and side.stat().st_size
     ]
-    with ExitStack() as stack:
-        flags = "immutable=1"
-        if left:
-            folder = Path(stack.enter_context(TemporaryDirectory(prefix="flexid-")))
-            for part in (file, *left):
-                try:
-                    shutil.copyfile(part, folder / part.name)
-                except OSError as error:
-                    raise unreadable(part, error) from error
-            file, flags = folder / file.name, "mode=rw"
-        with decoding(shown, "its database"):
-            database = sqlite3.connect(f"file:{quote(str(file))}?{flags}", uri=True)
-        stack.callback(database.close)
-        storage = _SqliteFile(shown, database)
-        if left:
-            storage.notes.append(Note(f"{shown} was not closed by its recorder; {left[0].name} was read too"))
-        yield storage
-
-
-class _SqliteFile:
-    """One open sqlite3 storage file."""
-
-    def __init__(self, path: Path, database: sqlite3.Connection) -> None:
-        self.path = path
-        self.notes: list[Note] = []
-        self._database = database
-        with decoding(path, "its database"):
-            tables = {
-                name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-            }
-        if not {"topics", "messages"} <= tables:
-            raise InputError(
-                f"{path} is an sqlite3 file, but no rosbag2 recording", "it has no table of messages"
-            )
-        with decoding(path, "its tables"):
-            self._kinds = self._topics("message_definitions" in tables)
-
-    def _topics(self, described: bool) -> dict[int, TopicType]:
-        definitions: dict[str, tuple[str, str]] = {}
-        if described:
-            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            definitions = {name: (encoding, text) for name, encoding, text in self._database.execute(query)}
-        kinds = {}
-        for number, topic, msgtype, encoding in self._database.execute(
-            "SELECT id, name, type, serialization_format FROM topics"
-        ):
-            schema_encoding, text = definitions.get(msgtype, ("", ""))
-            if not text.strip():
-                schema_encoding = ""
-            kinds[number] = TopicType(topic, msgtype, encoding, schema_encoding, text.encode())
-        return kinds
-
-    def probe(self) -> Probe:
-        """Count the messages, and keep every topic's first."""
-        probe = Probe()
-        with decoding(self.path, "its table of messages"):
-            counts = self._database.execute(
-                "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"
-            ).fetchall()
-            first = self._database.execute("SELECT timestamp FROM messages ORDER BY id LIMIT 1").fetchone()
-        for number, count in counts:
-            if number not in self._kinds:
-                raise damaged(self.path, f"a message belongs to topic {number}, which is not described")
-            for message in self._read([number]):
-                probe.add(message.kind, message.log_time, message.data)
-                if probe.counts[message.kind] > len(probe.samples[message.kind]):
-                    break
-            seen = probe.counts[self._kinds[number]]
-            probe.counts[self._kinds[number]] = max(seen, count)
-        probe.first_log_time = first[0] if first else None
-        return probe
-
-    def messages(self, wanted: Callable[[str], bool]) -> Iterator[Message]:
-        """Yield the messages of the wanted topics in the order they were recorded."""
-        return self._read([number for number, kind in self._kinds.items() if wanted(kind.topic)])
-
-    def _read(self, topics: Sequence[int]) -> Iterator[Message]:
-        places = ",".join("?" * len(topics))
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({places}) ORDER BY id"  # noqa: S608
-        with decoding(self.path, "its table of messages"):
-            rows = self._database.execute(query, list(topics))
-        count = 0
-        while True:
-            with decoding(self.path, f"what follows its message {count}"):
-                batch = rows.fetchmany(4096)
-            if not batch:
-                return
-            for number, log_time, data in batch:
-                if not isinstance(log_time, int) or not isinstance(data, bytes):
-                    raise damaged(self.path, f"its message {count + 1} has no stamp or no content")
-                count += 1
-                yield Message(self._kinds[number], log_time, None, data)
+    failure = None
+    if left:
+        folder = _temporary(stack)
+        for part in (file, *left):
+            try:
+                shutil.copyfile(part, folder / part.name)
+            except OSError as error:
+                raise unreadable(part, error) from error
+        file = folder / file.name
+        failure = close_recording(file)
+    storage = SqliteFile(file, shown, stack, progress)
+    if left:
+        storage.notes.append(Note(f"{shown} was not closed by its recorder; {left[0].name} was read too"))
+    if failure is not None:
+        storage.report(f"{left[0]} {failure}", None)
+    if cut is not None:
+        storage.report(cut, None)
+    return storage

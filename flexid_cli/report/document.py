@@ -46,11 +46,29 @@ _PART_OF_A_RUN = "one of several files of one run: samples and duration of the r
 
 @dataclass(frozen=True)
 class Damage:
-    """Samples of one file by how far they can be trusted."""
+    """Samples of one file by how far they can be trusted.
+
+    Attributes
+    ----------
+    trusted, suspect : int
+        Samples that are right as far as the file can tell, and those of damaged places.
+    lost : int or None
+        Samples that could not be read; None where their number cannot be known.
+    lost_bytes, lost_chunks : int
+        What of the file gave nothing.
+    spans_s : tuple of (float, float)
+        Stretches without trusted samples, in seconds from the first message of the run.
+    reasons : tuple of str
+        What is damaged, with positions in the file.
+    """
 
     trusted: int
     suspect: int = 0
-    lost: int = 0
+    lost: int | None = 0
+    lost_bytes: int = 0
+    lost_chunks: int = 0
+    spans_s: tuple[tuple[float, float], ...] = ()
+    reasons: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -163,7 +181,15 @@ def _input(file: InputFile, recording: Recording, *, single: bool) -> dict[str, 
         "duration": duration_s,
         "damage": None
         if damage is None
-        else {"trusted": damage.trusted, "suspect": damage.suspect, "lost": damage.lost},
+        else {
+            "trusted": damage.trusted,
+            "suspect": damage.suspect,
+            "lost": damage.lost,
+            "lost_bytes": damage.lost_bytes,
+            "lost_chunks": damage.lost_chunks,
+            "spans_s": damage.spans_s,
+            "reasons": damage.reasons,
+        },
         "damage_reason": _DAMAGE_UNKNOWN if damage is None else "",
         "notes": notes,
     }

@@ -157,9 +157,10 @@ def _data_quality(document: Mapping[str, Any]) -> list[str]:
 
 def _input_notes(entry: Mapping[str, Any]) -> list[str]:
     notes, damage = words.input_notes(entry), entry["damage"]
-    if damage is not None and (damage["suspect"] or damage["lost"]):
-        counts = ", ".join(f"{count} {kind}" for kind, count in damage.items())
-        notes.insert(0, f"{entry['path']}: damaged file, samples: {counts}")
+    if damage is not None and (damage["suspect"] or damage["lost"] != 0):
+        counts = ", ".join(f"{damage[kind]} {kind}" for kind in ("trusted", "suspect"))
+        lost = "an unknown number" if damage["lost"] is None else damage["lost"]
+        notes.insert(0, f"{entry['path']}: damaged file, samples: {counts}, {lost} lost")
     return [escape(note) for note in notes]
 
 

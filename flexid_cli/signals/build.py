@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexid_cli.errors import DataError, InputError, UsageError
-from flexid_cli.readers.base import RawChannel, RawLog
+from flexid_cli.readers.base import DEFAULT_OPTIONS, RawChannel, RawLog, ReadOptions
 from flexid_cli.signals.convert import Converted, convert_position, convert_torque
 from flexid_cli.signals.recording import Array, Recording, Segment
 from flexid_cli.signals.resample import PASS_BAND, STOP_DB, Resampled, resample
@@ -43,12 +43,16 @@ FASTEST_SLIDE = 100.0  # m/s
 MOTION_TOLERANCE = 0.08
 MOTION_BLOCKS = (200, 60, 20)  # the longer the blocks, the less of a resonance is left in them
 FLEXIBLE = (0.5, 2.0)  # near a resonance the two sides do move differently far
+SPAN_ROUNDING_NS = 1000  # spans are told as seconds in floating point
 NEARLY_ONE = (0.85, 1.15)  # in slow motion they do not
 _TIME_NAME = re.compile(
     r"(?:\w*?[_. ])?(?:time|t|timestamp|time_?stamp|stamp|zeit|seconds?|secs?|epoch|clock)"
     r"(?:[_. ]?(?:s|sec|secs|seconds?|ms|msec|us|µs|usec|ns|nsec|nanos|millis|micros))?"
 )
 _UNIT_SUFFIX = re.compile(r"(?:[_. (\[]+)(s|sec|seconds?|ms|msec|us|µs|usec|ns|nsec)[)\] ]*$", re.IGNORECASE)
+
+
+_RowTimes = tuple[IntArray, BoolArray]
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,9 @@ class _Signal:
     source: str
 
 
-def build_recording(paths: Sequence[Path], config: Config) -> tuple[Recording, RawLog]:
+def build_recording(
+    paths: Sequence[Path], config: Config, options: ReadOptions = DEFAULT_OPTIONS
+) -> tuple[Recording, RawLog]:
     """Read the signals that the configuration names, and bring them to one joint-side SI recording.
 
     Parameters
@@ -79,6 +85,8 @@ def build_recording(paths: Sequence[Path], config: Config) -> tuple[Recording, R
         All files of one run.
     config : Config
         The axis and its signals.
+    options : ReadOptions
+        The window, and what is done with damage.
 
     Returns
     -------
@@ -95,7 +103,7 @@ def build_recording(paths: Sequence[Path], config: Config) -> tuple[Recording, R
     DataError
         The signals never overlap in time, or one of them never changes.
     """
-    raw, time = _read(paths, config)
+    raw, time = _read(paths, config, options)
     return recording_from_raw(raw, config, time), raw
 
 
@@ -114,7 +122,9 @@ def recording_from_raw(raw: RawLog, config: Config, time: RawChannel | None = No
     sources = _sources(config)
     channels = {role: raw.channels[source] for role, source in sources.items()}
     clock = _choose(channels, config, time)
+    _refuse_shifted_rows(raw, config)
     timelines = _clean(clock, _max_gap(config))
+    timelines = {role: _broken(timeline, channels[role], raw) for role, timeline in timelines.items()}
     signals = _convert_all(channels, sources, timelines, clock.name, config)
     for signal in signals.values():
         _require_motion(signal)
@@ -160,15 +170,66 @@ def _max_gap(config: Config) -> float | None:
 # --- reading ------------------------------------------------------------
 
 
-def _read(paths: Sequence[Path], config: Config) -> tuple[RawLog, RawChannel | None]:
+def _read(paths: Sequence[Path], config: Config, options: ReadOptions) -> tuple[RawLog, RawChannel | None]:
     """Return the log, and the channel that holds its times where these are not the log's own stamps."""
     from flexid_cli.readers.registry import open_reader, read_log
 
     time = config.signals.time
     source = _time_source(paths, config, is_csv=open_reader(paths, csv=config.csv).name == "csv")
-    raw = read_log(paths, _given_sources(config), csv=config.csv, time_source=source)
+    raw = read_log(paths, _given_sources(config), csv=config.csv, time_source=source, options=options)
     rate = None if time is None else time.rate_hz
-    return raw, None if source is None or rate is not None else raw.channels.get(str(source))
+    column = None if source is None or rate is not None else raw.channels.get(str(source))
+    if raw.format == "csv":
+        raw = cut_table(raw, _row_times(raw, column, config, rate), options)
+        column = None if column is None else raw.channels[str(source)]
+    return raw, column
+
+
+def _row_times(raw: RawLog, column: RawChannel | None, config: Config, rate: float | None) -> _RowTimes:
+    if column is not None:
+        return _column_stamps(column, config)
+    rows = max((channel.values.size for channel in raw.channels.values()), default=0)
+    return fixed_rate_stamps(rows, rate or 1.0), np.ones(rows, dtype=np.bool_)
+
+
+def cut_table(raw: RawLog, times: _RowTimes, options: ReadOptions) -> RawLog:
+    """Keep the rows of a table that lie in the window of ``options``, counted from its first valid time.
+
+    Parameters
+    ----------
+    raw : RawLog
+        Channels of one length, n rows.
+    times : (stamps in ns, valid), each of shape (n,)
+        Of the rows.
+    options : ReadOptions
+        Their window.
+
+    Raises
+    ------
+    InputError
+        No row lies in it.
+    """
+    stamps, valid = times
+    if options.window(0).is_open or not valid.any():
+        return raw
+    first = int(stamps[np.argmax(valid)])
+    inside = valid & options.window(first).holds(stamps)
+    if not inside.any():
+        raise InputError(
+            f"{raw.paths[0]}: nothing was recorded in the window from --start to --end",
+            f"its times go up to {(int(stamps[valid].max()) - first) / NS:.6g} s",
+        )
+    return replace(raw, channels={name: _rows(channel, inside) for name, channel in raw.channels.items()})
+
+
+def _rows(channel: RawChannel, rows: BoolArray) -> RawChannel:
+    return replace(
+        channel,
+        values=channel.values[rows],
+        stamps={clock: times[rows] for clock, times in channel.stamps.items()},
+        exact=None if channel.exact is None else channel.exact[rows],
+        suspect=None if channel.suspect is None else channel.suspect[rows],
+    )
 
 
 def _time_source(paths: Sequence[Path], config: Config, *, is_csv: bool) -> str | int | None:
@@ -286,6 +347,35 @@ def _clean(clock: _Clock, max_gap_s: float | None) -> dict[str, Timeline]:
             distinct.append((role, stamps, valid))
     timelines = build_timelines(distinct, max_gap_s)
     return {role: timelines[number] for role, number in place.items()}
+
+
+def _broken(timeline: Timeline, channel: RawChannel, raw: RawLog) -> Timeline:
+    """Break a clock where samples were lost, however few: what damage took away is never interpolated."""
+    log_time = channel.stamps.get("log_time")
+    if log_time is None or raw.first_ns is None:
+        return timeline
+    reached = np.maximum.accumulate(log_time)
+    samples = []
+    for begin, end in (span for damage in raw.damage for span in damage.spans_s):
+        sample = int(np.searchsorted(reached, raw.first_ns + round(end * NS) - SPAN_ROUNDING_NS))
+        before = raw.first_ns + round(begin * NS) + SPAN_ROUNDING_NS
+        if 0 < sample < reached.size and reached[sample - 1] <= before:  # else samples in doubt were kept
+            samples.append(sample)
+    return timeline.broken_at(samples) if samples else timeline
+
+
+def _refuse_shifted_rows(raw: RawLog, config: Config) -> None:
+    """Without stamps, a sample that is missing inside the record would shift all that follow it."""
+    time = config.signals.time
+    if time is None or time.rate_hz is None:
+        return
+    for damage in raw.damage:
+        if damage.lost or damage.suspect:
+            raise InputError(
+                f"{damage.path}: samples are lost, so a fixed rate_hz cannot place those after them; "
+                + damage.sentence(),
+                "name a column or clock that holds the time in signals.time.source",
+            )
 
 
 # --- signals ------------------------------------------------------------

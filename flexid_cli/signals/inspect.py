@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexid_cli.errors import InputError, UsageError
-from flexid_cli.readers.base import ChannelInfo, RawChannel
-from flexid_cli.signals.build import find_time_column, time_unit_of
+from flexid_cli.readers.base import DEFAULT_OPTIONS, ChannelInfo, Damage, RawChannel, ReadOptions
+from flexid_cli.signals.build import cut_table, find_time_column, time_unit_of
 from flexid_cli.signals.recording import ClockStatistics
 from flexid_cli.signals.timebase import (
     CLOCKS,
@@ -79,6 +79,8 @@ class Inspection:
         In the order of the log.
     notes : tuple of str
         What the reader met.
+    damage : tuple of Damage
+        One entry per file.
     """
 
     format: str
@@ -88,13 +90,16 @@ class Inspection:
     time_unit: str | None
     channels: tuple[ChannelSummary, ...]
     notes: tuple[str, ...] = ()
+    damage: tuple[Damage, ...] = ()
 
 
 _Stamps = tuple[str, IntArray, BoolArray | None]
 
 
-def inspect_log(paths: Sequence[Path], csv: CsvOptions | None = None) -> Inspection:
-    """Read a whole log and describe every channel.
+def inspect_log(
+    paths: Sequence[Path], csv: CsvOptions | None = None, options: ReadOptions = DEFAULT_OPTIONS
+) -> Inspection:
+    """Read a log, or the window of it that ``options`` names, and describe every channel.
 
     Raises
     ------
@@ -107,12 +112,16 @@ def inspect_log(paths: Sequence[Path], csv: CsvOptions | None = None) -> Inspect
     if not infos:
         hint = "record joint states, currents or encoder positions"
         raise InputError(f"{paths[0]} holds no numeric channel", hint)
-    raw = read_log(paths, [info.source for info in infos], csv=csv)
+    raw = read_log(paths, [info.source for info in infos], csv=csv, options=options)
     column = None
     if not any(channel.stamps for channel in raw.channels.values()):
         column = find_time_column([info.source for info in infos])
     unit = _time_unit(raw.channels[column]) if column is not None else None
     time = _column_stamps(raw.channels[column], unit or "s") if column is not None else None
+    if time is not None and column is not None:
+        valid = np.ones(time[1].size, dtype=np.bool_) if time[2] is None else time[2]
+        raw = cut_table(raw, (time[1], valid), options)
+        time = _column_stamps(raw.channels[column], unit or "s")
     clocks = {info.source: _clock_of(raw.channels[info.source], time) for info in infos}
     return Inspection(
         format=raw.format,
@@ -122,6 +131,7 @@ def inspect_log(paths: Sequence[Path], csv: CsvOptions | None = None) -> Inspect
         time_unit=unit,
         channels=tuple(_summary(info, raw.channels[info.source], clocks[info.source]) for info in infos),
         notes=tuple(note.message for note in raw.notes),
+        damage=raw.damage,
     )
 
 
@@ -195,7 +205,21 @@ def as_document(inspection: Inspection, proposal: str) -> dict[str, object]:
         "time_unit": inspection.time_unit,
         "channels": [_channel_document(channel) for channel in inspection.channels],
         "notes": list(inspection.notes),
+        "damage": [_damage_document(damage) for damage in inspection.damage],
         "proposed_config": proposal,
+    }
+
+
+def _damage_document(damage: Damage) -> dict[str, object]:
+    return {
+        "path": str(damage.path),
+        "trusted": damage.trusted,
+        "suspect": damage.suspect,
+        "lost": damage.lost,
+        "lost_bytes": damage.lost_bytes,
+        "lost_chunks": damage.lost_chunks,
+        "spans_s": [list(span) for span in damage.spans_s],
+        "reasons": list(damage.reasons),
     }
 
 

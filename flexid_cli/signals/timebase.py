@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,6 +133,8 @@ class Timeline:
         Samples put back in order; samples without a usable stamp.
     quantum_ns : int
         Step to which the stamps had been rounded, where that was undone, else 0.
+    breaks : tuple of int
+        Times of the first samples after lost ones; nothing is put between them and the samples before.
     """
 
     order: NDArray[np.intp]
@@ -141,6 +143,13 @@ class Timeline:
     reordered: int = 0
     invalid: int = 0
     quantum_ns: int = 0
+    breaks: tuple[int, ...] = ()
+
+    def broken_at(self, samples: Sequence[int]) -> Timeline:
+        """Return the timeline with breaks before ``samples``, by their number in the log."""
+        places = np.searchsorted(np.maximum.accumulate(self.order), np.asarray(samples, dtype=np.intp))
+        found = {int(self.stamps[place]) for place in places.tolist() if 0 < place < self.stamps.size}
+        return replace(self, breaks=tuple(sorted({*self.breaks, *found})))
 
 
 def build_timelines(
@@ -374,11 +383,20 @@ def mean_period(steps: IntArray, limit_ns: float) -> float:
     return float(inside.sum() / np.maximum(np.rint(inside / np.median(inside)), 1.0).sum())
 
 
-def split_at_gaps(stamps: IntArray, limit_ns: float) -> list[tuple[int, int]]:
-    """Index ranges (first, stop) between steps longer than ``limit_ns``."""
-    cuts = np.flatnonzero(np.diff(stamps) > limit_ns) + 1
+def split_at_gaps(stamps: IntArray, limit_ns: float, breaks: Sequence[int] = ()) -> list[tuple[int, int]]:
+    """Index ranges (first, stop) between steps longer than ``limit_ns``, and before ``breaks``."""
+    is_gap = (np.diff(stamps) > limit_ns) | _broken(stamps, breaks)
+    cuts = np.flatnonzero(is_gap) + 1
     edges = [0, *cuts.tolist(), int(stamps.size)]
     return [(first, stop) for first, stop in itertools.pairwise(edges) if stop > first]
+
+
+def _broken(stamps: IntArray, breaks: Sequence[int]) -> BoolArray:
+    """Which steps between ``stamps`` lead over a break, shape (n - 1,)."""
+    broken = np.zeros(max(stamps.size - 1, 0), dtype=np.bool_)
+    places = np.searchsorted(stamps, np.asarray(breaks, dtype=np.int64)) - 1
+    broken[places[(places >= 0) & (places < broken.size)]] = True
+    return broken
 
 
 @dataclass(frozen=True)
@@ -451,10 +469,10 @@ def make_track(
         "resets": len(timeline.starts),
         "invalid": timeline.invalid + int(finite.size - np.count_nonzero(finite)),
     }
-    statistics = _statistics(name, clock, stamps, timeline.starts, limit, counts)
+    statistics = _statistics(name, clock, stamps, timeline, limit, counts)
     return Track(
         name, stamps, kept, period, limit, _is_uniform(steps, period, limit),
-        tuple(split_at_gaps(stamps, limit)), statistics,
+        tuple(split_at_gaps(stamps, limit, timeline.breaks)), statistics,
     )  # fmt: skip
 
 
@@ -476,17 +494,15 @@ def _too_few(name: str, source: str, values: Array, *, timed: int, usable: int) 
 
 
 def _statistics(
-    signal: str, clock: str, stamps: IntArray, starts: Sequence[int], limit: float, counts: Mapping[str, int]
+    signal: str, clock: str, stamps: IntArray, timeline: Timeline, limit: float, counts: Mapping[str, int]
 ) -> ClockStatistics:
     steps = np.diff(stamps)
-    inside = steps[steps <= limit] if np.any(steps <= limit) else steps
+    is_gap = (steps > limit) | _broken(stamps, timeline.breaks)
+    inside = steps[~is_gap] if not is_gap.all() else steps
     median = float(np.median(inside))
     missing = np.rint(inside / mean_period(steps, limit))
     single = inside[inside < 1.5 * median]
-    own = np.ones(steps.size, dtype=np.bool_)
-    at_reset = np.searchsorted(stamps, np.asarray(starts, dtype=np.int64)) - 1
-    own[at_reset[(at_reset >= 0) & (at_reset < steps.size)]] = False
-    gaps = steps[own & (steps > limit)]
+    gaps = steps[is_gap & ~_broken(stamps, timeline.starts)]
     return ClockStatistics(
         signal=signal,
         clock=clock,

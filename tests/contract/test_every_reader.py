@@ -401,12 +401,11 @@ def test_truncated_files_give_one_error_or_whole_samples(name: str, maker: Maker
         log = read_damaged(path)
         if log is None:
             continue
-        assert name != "mcap"
         for source, values in TABLE.channels.items():
             read = log.channels[source].values
             assert np.array_equal(read, values[: read.size], equal_nan=True)
         if log.channels[SOURCES[0]].values.size < ROWS:
-            assert log.notes
+            assert log.notes or not all(one.is_harmless for one in log.damage)
 
 
 @pytest.mark.parametrize(("name", "maker"), CASES)
