@@ -16,16 +16,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
-from mcap.writer import CompressionType, IndexType
-from mcap.writer import Writer as McapWriter
 from numpy.typing import NDArray
-from rosbags.rosbag1 import Writer as BagWriter
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Rosbag2Writer
-from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.store import Typestore
+
+if TYPE_CHECKING:  # else imported where used, for what is measured must not bear the writers' memory
+    from mcap.writer import Writer as McapWriter
+    from rosbags.typesys.store import Typestore
 
 TOPIC = "/joint_states"
 MSGTYPE = "sensor_msgs/msg/JointState"
@@ -133,12 +131,14 @@ def _put(data: NDArray[np.uint8], place: int, values: NDArray[np.generic]) -> No
 
 def ros2_payloads() -> Payloads:
     """Payloads in CDR."""
+    from rosbags.typesys import Stores, get_typestore
+
     return Payloads(get_typestore(Stores.ROS2_HUMBLE))
 
 
-def mcap(folder: Path, count: int, *, compression: CompressionType, chunked: bool = True) -> Path:
+def mcap(folder: Path, count: int, *, compression: str, chunked: bool = True) -> Path:
     """Write an MCAP file with ros2msg schemas, as rosbag2 does."""
-    path = folder / f"{compression.name.lower()}{'' if chunked else '_unchunked'}.mcap"
+    path = folder / f"{compression}{'' if chunked else '_unchunked'}.mcap"
     payloads = ros2_payloads()
     with path.open("wb") as stream:
         writer = _mcap_writer(stream, compression, chunked=chunked)
@@ -150,10 +150,17 @@ def mcap(folder: Path, count: int, *, compression: CompressionType, chunked: boo
     return path
 
 
-def _mcap_writer(stream: object, compression: CompressionType, *, chunked: bool = True) -> McapWriter:
+def _mcap_writer(stream: IO[bytes], compression: str, *, chunked: bool = True) -> McapWriter:
+    from mcap.writer import CompressionType, IndexType
+    from mcap.writer import Writer as McapWriter
+
     index = IndexType.ALL if chunked else IndexType.NONE
     writer = McapWriter(
-        stream, chunk_size=CHUNK, compression=compression, index_types=index, use_chunking=chunked
+        stream,
+        chunk_size=CHUNK,
+        compression=CompressionType[compression.upper()],
+        index_types=index,
+        use_chunking=chunked,
     )
     writer.start(profile="ros2")
     return writer
@@ -173,7 +180,7 @@ def mixed(folder: Path, count: int) -> Path:
     text = store.types["std_msgs/msg/String"]
     texts = [bytes(store.serialize_cdr(text("a" * k), "std_msgs/msg/String")) for k in range(60, 160)]
     with path.open("wb") as stream:
-        writer = _mcap_writer(stream, CompressionType.ZSTD)
+        writer = _mcap_writer(stream, "zstd")
         wanted = _channel(writer, store, TOPIC, MSGTYPE)
         others = [_channel(writer, store, f"/other_{k}", "std_msgs/msg/String") for k in range(3)]
         camera = _channel(writer, store, "/camera", "sensor_msgs/msg/Image")
@@ -201,7 +208,7 @@ def json_mcap(folder: Path, count: int) -> Path:
     """Write an MCAP file of JSON messages."""
     path = folder / "json.mcap"
     with path.open("wb") as stream:
-        writer = _mcap_writer(stream, CompressionType.ZSTD)
+        writer = _mcap_writer(stream, "zstd")
         schema = writer.register_schema("JointState", "jsonschema", b'{"type": "object"}')
         channel = writer.register_channel(TOPIC, "json", schema)
         for block in blocks(count):
@@ -218,8 +225,10 @@ def json_mcap(folder: Path, count: int) -> Path:
 
 def db3(folder: Path, count: int) -> Path:
     """Write a rosbag2 folder with sqlite3 storage."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
     path, payloads = folder / "sqlite3", ros2_payloads()
-    with Rosbag2Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+    with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connection = writer.add_connection(TOPIC, MSGTYPE, typestore=payloads.store)
         first = next(blocks(1))
         writer.write(connection, int(first.stamps[0]), payloads.of(first)[0])
@@ -243,11 +252,14 @@ def db3(folder: Path, count: int) -> Path:
 
 def bag(folder: Path, count: int, *, compression: str) -> Path:
     """Write a ROS 1 bag."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
     path = folder / f"{compression}.bag"
     payloads = Payloads(get_typestore(Stores.ROS1_NOETIC), ros1=True)
-    writer = BagWriter(path)
+    writer = Writer(path)
     if compression != "none":
-        writer.set_compression(BagWriter.CompressionFormat[compression.upper()])
+        writer.set_compression(Writer.CompressionFormat[compression.upper()])
     with writer:
         connection = writer.add_connection(TOPIC, MSGTYPE, typestore=payloads.store)
         for block in blocks(count):
@@ -268,10 +280,10 @@ def table(folder: Path, count: int) -> Path:
 
 Maker = Callable[[Path, int], Path]
 MAKERS: dict[str, Maker] = {
-    "mcap_zstd": partial(mcap, compression=CompressionType.ZSTD),
-    "mcap_lz4": partial(mcap, compression=CompressionType.LZ4),
-    "mcap_none": partial(mcap, compression=CompressionType.NONE),
-    "mcap_unchunked": partial(mcap, compression=CompressionType.NONE, chunked=False),
+    "mcap_zstd": partial(mcap, compression="zstd"),
+    "mcap_lz4": partial(mcap, compression="lz4"),
+    "mcap_none": partial(mcap, compression="none"),
+    "mcap_unchunked": partial(mcap, compression="none", chunked=False),
     "mcap_mixed": mixed,
     "mcap_json": json_mcap,
     "sqlite3": db3,

@@ -43,6 +43,7 @@ from flexid_cli.readers.path import missing_channel
 from flexid_cli.readers.rows import RowReader, Rows
 
 _HEAD = 1 << 18
+_WORTH_THREADS = 1 << 24  # bytes of a file; each thread makes a parser of its own
 _SPLICE = 1 << 16  # samples converted in place at once
 # Damage leaves most lines whole. Where more than this share of them does not fit, the table is not written
 # as it seems to be, and what does fit may be read wrong.
@@ -373,8 +374,10 @@ class _Table:
         """Parse block by block in threads, in the order of the file, and keep account."""
         encoding = self._encoding.removesuffix("-sig") if self._raw else "utf-8"
         parse = RowReader(self.dialect, encoding, wanted)
+        if threads is None:
+            threads = 1 if _size(self.path) < _WORTH_THREADS else os.cpu_count() or 1
         stop = 0
-        with closing(in_order(parse, self._blocks(advance), threads or os.cpu_count() or 1)) as items:
+        with closing(in_order(parse, self._blocks(advance), threads)) as items:
             for item in items:
                 if isinstance(item, Fault):
                     account.fault(item, stop)
