@@ -94,7 +94,10 @@ class TypedJson:
         self, typed: _Typed, objects: Sequence[Any], members: NDArray[np.int64], data: bytes
     ) -> Part | None:
         """Decode messages that have the names of the one whose bytes are ``data``."""
-        message = self._general(data)
+        try:
+            message = self._general(data)
+        except ValueError:  # not JSON, or bytes that are no text: the caller decodes these one by one
+            return None
         taken: dict[Leaf, list[Any]] = {}
         good = np.ones(members.size, dtype=np.bool_)
         for leaf in self._leaves:

@@ -259,7 +259,7 @@ class SqliteFile:
                 found: tuple[Any, Any] = database.execute(query, (low, high)).fetchone()
             finally:
                 database.close()
-        except (sqlite3.Error, OverflowError):
+        except (sqlite3.Error, OverflowError, UnicodeDecodeError):  # its message may hold the damaged bytes
             return None
         return found
 
