@@ -81,11 +81,11 @@ def main(folder: Path) -> None:
         write_rosbag2(target, table, storage=storage, compression="file")
     truth = {
         "source": "Pham, Gautier, Poignet, ICRA 2001, Table 1; joint side, SI",
-        "axis": asdict(AXIS),
+        "axis": _given(AXIS),
         "resonance_hz": AXIS.resonance_hz,
         "antiresonance_hz": AXIS.antiresonance_hz,
-        "controller": asdict(CONTROLLER),
-        "sensors": asdict(SENSORS),
+        "controller": _given(CONTROLLER),
+        "sensors": {name: value for name, value in asdict(SENSORS).items() if value != 0.0},
         "gear_ratio": GEAR_RATIO,
         "torque_constant_nm_per_a": TORQUE_CONSTANT,
         "sample_rate_hz": SAMPLE_RATE_HZ,
@@ -93,6 +93,11 @@ def main(folder: Path) -> None:
     }
     (folder / "axis3.truth.json").write_text(json.dumps(truth, indent=2) + "\n", encoding="utf-8")
     write_sums(folder)
+
+
+def _given(machine: Axis | Controller) -> dict[str, float]:
+    """Values by name, without what is not given."""
+    return {name: value for name, value in asdict(machine).items() if value is not None}
 
 
 def write_sums(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -73,7 +74,21 @@ class Console:
     def _say(self, text: str) -> None:
         # Where standard error is closed there is nobody left to tell.
         with suppress(OSError, ValueError):
-            click.echo(text, err=True, color=wants_color())
+            click.echo(_wrapped(text), err=True, color=wants_color())
+
+
+def _wrapped(text: str) -> str:
+    """Break a long line between words where a terminal would break it within one."""
+    if "\n" in text or not sys.stderr.isatty():
+        return text
+    import shutil
+    import textwrap
+
+    indent = " " * (2 + len(text) - len(text.lstrip()))
+    width = max(shutil.get_terminal_size().columns, 40)
+    return textwrap.fill(
+        text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )  # fmt: skip
 
 
 pass_console = click.make_pass_decorator(Console, ensure=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -133,20 +134,49 @@ class Damage:
         """Whether every sample is there and can be trusted."""
         return not (self.suspect or self.lost or self.lost is None or self.lost_bytes or self.lost_chunks)
 
+    def cause(self) -> str:
+        """Return the first reason, without the path: what follows it is a line number, or a word."""
+        if not self.reasons:
+            return ""
+        reason = self.reasons[0].removeprefix(f"{self.path}:").strip()
+        line, mark, words = reason.partition(": ")
+        if reason != self.reasons[0] and mark and line.isdecimal():
+            reason = f"line {line}: {words}"
+        return reason
+
     def sentence(self, *, suspect_kept: bool = False) -> str:
         """Say in one sentence what was lost, and where the first damaged place is."""
-        parts = [f"{self.trusted} samples can be trusted"]
+        parts = []
         if self.suspect:
+            were = "was" if self.suspect == 1 else "were"
             fate = "used nevertheless" if suspect_kept else "left out"
-            parts.append(f"{self.suspect} may be wrong and were {fate}")
-        if self.lost != 0 or self.lost_bytes:
-            parts.append(f"{'an unknown number' if self.lost is None else self.lost} are lost")
+            parts.append(f"{self.suspect} may be wrong and {were} {fate}")
+        if self.lost is None:
+            parts.append("an unknown number is lost")
+        elif self.lost:
+            parts.append(f"{self.lost} {'is' if self.lost == 1 else 'are'} lost")
+        elif self.lost_bytes:
+            parts.append("none is lost")
+        total = f"{self.trusted} {_noun(self.trusted, 'sample')} can be trusted"
+        text = f"{self.path} is damaged: {', '.join([total, *parts])}"
         if self.spans_s:
-            shown = ", ".join(f"{first:.6g} to {last:.6g} s" for first, last in self.spans_s[:_SPANS_SHOWN])
-            more = f" and {len(self.spans_s) - _SPANS_SHOWN} more" if len(self.spans_s) > _SPANS_SHOWN else ""
-            parts.append(f"without trusted samples: {shown}{more}")
-        cause = f" ({self.reasons[0]})" if self.reasons else ""
-        return f"{self.path} is damaged{cause}: {'; '.join(parts)}"
+            shown = ", ".join(_span(*span) for span in self.spans_s[:_SPANS_SHOWN])
+            more = len(self.spans_s) - _SPANS_SHOWN
+            text += f"; no trusted sample from {shown}"
+            text += f" and in {more} more {_noun(more, 'gap')}" if more > 0 else ""
+        if not self.reasons:
+            return text
+        return f"{text}. {'Cause' if len(self.reasons) == 1 else 'First cause'}: {self.cause()}"
+
+
+def _noun(count: int, singular: str) -> str:
+    return singular if count == 1 else f"{singular}s"
+
+
+def _span(first: float, last: float) -> str:
+    """Spell a stretch of time with as many decimals as its length needs."""
+    decimals = max(0, min(9, 2 - math.floor(math.log10(last - first) + 1e-6))) if last > first else 3
+    return f"{first:.{decimals}f} to {last:.{decimals}f} s"
 
 
 @dataclass(frozen=True)
@@ -212,11 +242,32 @@ class Note:
 
 
 @dataclass(frozen=True)
+class LostRows:
+    """A place of a table where rows are missing among its samples.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    before : int
+        Number of the sample that follows, from 0; the number of samples where none does.
+    count : int or None
+        Rows that are missing; None where that is not known for sure; 0 where none is, but the samples from
+        here on may be wrong and were kept.
+    """
+
+    path: Path
+    before: int
+    count: int | None
+
+
+@dataclass(frozen=True)
 class RawLog:
     """All channels that were asked for, from all files of one run, in the order they were recorded.
 
     ``damage`` has one entry per file, in the order of ``paths``. ``first_ns`` is the log time of the run's
-    first message, from which spans and windows count; None for tables.
+    first message, from which spans and windows count; None for tables. ``lost_rows`` are the places of a table
+    where rows are missing, ascending and each once; a message log has the stamps to see them by.
     """
 
     format: str
@@ -225,6 +276,7 @@ class RawLog:
     notes: tuple[Note, ...] = ()
     damage: tuple[Damage, ...] = ()
     first_ns: int | None = None
+    lost_rows: tuple[LostRows, ...] = ()
 
 
 DEFAULT_OPTIONS = ReadOptions()

@@ -31,6 +31,8 @@ class Batch:
         False where the messages may be wrong: a stored checksum does not hold, or the place is damaged.
     checked : bool
         Whether a stored checksum covers these bytes and was verified.
+    stride : int
+        Bytes from one payload to the next, where it is known that it is always the same, else 0.
     """
 
     kind: TopicType
@@ -41,6 +43,7 @@ class Batch:
     publish_time: NDArray[np.int64] | None
     trusted: bool = True
     checked: bool = False
+    stride: int = 0
 
     def payload(self, row: int) -> bytes:
         """Return the bytes of one message."""

@@ -364,16 +364,22 @@ class _Tally:
     suspect: int = 0
     bad: int = 0
     reasons: list[str] = field(default_factory=list)
+    spans_ns: list[tuple[int, int]] = field(default_factory=list)  # around bad messages and those in doubt
+    bad_times: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
     places: dict[str, tuple[int, int]] = field(default_factory=dict)  # its messages in the topics' outputs
 
     def doubt(self, output: TopicOutput) -> None:
-        """Count this file's messages with samples that are not plausible as suspect."""
+        """Count this file's messages with samples that are not plausible as suspect, and note what they leave."""
         first, end = self.places.get(output.topic, (0, 0))
         mine = [doubt.rows[(doubt.rows >= first) & (doubt.rows < end)] for doubt in output.doubts]
         self.reasons += [doubt.reason for doubt, rows in zip(output.doubts, mine, strict=True) if rows.size]
-        count = np.unique(np.concatenate(mine)).size if mine else 0
-        self.trusted -= count
-        self.suspect += count
+        rows = np.unique(np.concatenate(mine)) if mine else np.empty(0, dtype=np.int64)
+        self.trusted -= rows.size
+        self.suspect += rows.size
+        times = self.bad_times.get(output.topic, [])
+        if rows.size or times:
+            lost = np.concatenate(times) if times else np.empty(0, dtype=np.int64)
+            self.spans_ns += output.spans_without(rows, lost)
 
 
 class _Reading:
@@ -403,6 +409,7 @@ class _Reading:
         before = {topic: output.size for topic, output in self._outputs.items()}
         for batch in file.batches(self._outputs.__contains__, self._window):
             self._add(file.path, within(batch, self._window), tally)
+            del batch  # its buffer is used again for the next one, while it is in the processor's cache
         tally.places = {topic: (before[topic], output.size) for topic, output in self._outputs.items()}
         return tally
 
@@ -428,6 +435,7 @@ class _Reading:
             return
         count = int(np.count_nonzero(bad))
         tally.bad += count
+        tally.bad_times.setdefault(batch.kind.topic, []).append(batch.log_time[bad])
         first = int(batch.log_time[bad][0])
         noun = "message" if count == 1 else "messages"
         tally.reasons.append(
@@ -459,12 +467,14 @@ def within(batch: Batch, window: Window) -> Batch:
         lengths=batch.lengths[inside],
         log_time=batch.log_time[inside],
         publish_time=published,
+        stride=0,
     )
 
 
 def _account(file: Container, tally: _Tally, first_ns: int, options: ReadOptions) -> Damage:
     """Return what could be read of ``file`` and what was lost; raise it where the options are strict."""
     loss = file.loss
+    spans_ns = sorted({*loss.spans_ns, *tally.spans_ns})
     damage = Damage(
         file.path,
         trusted=tally.trusted,
@@ -472,7 +482,7 @@ def _account(file: Container, tally: _Tally, first_ns: int, options: ReadOptions
         lost=None if loss.messages is None else loss.messages + tally.bad,
         lost_bytes=loss.size,
         lost_chunks=loss.chunks,
-        spans_s=tuple(((first - first_ns) / _NS, (last - first_ns) / _NS) for first, last in loss.spans_ns),
+        spans_s=tuple(((first - first_ns) / _NS, (last - first_ns) / _NS) for first, last in spans_ns),
         reasons=(*loss.reasons, *tally.reasons[:_MOST_REASONS]),
     )
     if options.strict and (damage.reasons or not damage.is_harmless):

@@ -7,7 +7,7 @@ import io
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +38,10 @@ from flexid_cli.readers.dialect import (
 from flexid_cli.readers.lines import Block, Cutter, in_order, is_like_ascii, unified
 from flexid_cli.readers.memory import keep_freed_memory
 from flexid_cli.readers.messages import needs_integers
-from flexid_cli.readers.packed import Fault, pieces
+from flexid_cli.readers.packed import Fault, has_checksum, pieces
 from flexid_cli.readers.path import missing_channel
 from flexid_cli.readers.rows import RowReader, Rows
+from flexid_cli.readers.table_gaps import TablePart, lost_rows, suspect_samples, without
 
 _HEAD = 1 << 18
 _WORTH_THREADS = 1 << 24  # bytes of a file; each thread makes a parser of its own
@@ -125,21 +126,30 @@ class CsvReader:
         places = {str(source): tables[0].place(source) for source in sources}
         progress = Progress(options, sum(_size(path) for path in paths))
         columns = {place: _Column() for place in sorted(set(places.values()))}
-        suspect: list[tuple[int, int]] = []
-        damage = [table.read(columns, suspect, options, progress) for table in tables]
-        total = next(iter(columns.values())).size if columns else 0
-        marks = _mask(suspect, total)
-        good = None if marks is None or options.keep_suspect else ~marks
-        if total == 0 or (good is not None and not good.any()):
-            raise _nothing(paths[0], damage, total)
+        accounts = [table.read(columns, options, progress) for table in tables]
         fields = tables[0].dialect.fields
-        kept = marks if options.keep_suspect else None
         channels = {
-            place: column.channel(fields[place].name, fields[place].unit, good, kept)
-            for place, column in columns.items()
+            place: column.channel(fields[place].name, fields[place].unit) for place, column in columns.items()
         }
+        parts = [account.part() for account in accounts]
+        damage = [account.damage() for account in accounts]
+        for number, (table, part) in enumerate(zip(tables, parts, strict=True)):
+            if not table.has_checksum or damage[number].reasons:
+                part.doubt(channels.values())
+                damage[number] = part.count(damage[number])
+        total = next(iter(columns.values())).size if columns else 0
+        marks = suspect_samples(parts, total)
+        if total == 0 or (marks is not None and marks.all() and not options.keep_suspect):
+            raise _nothing(paths[0], damage, total)
+        if options.strict and any(one.reasons for one in damage):
+            raise _damaged(damage)
+        if marks is not None and options.keep_suspect:
+            channels = {place: replace(channel, suspect=marks) for place, channel in channels.items()}
+        elif marks is not None:
+            channels = without(channels, marks)
+        lost = lost_rows(parts, None if options.keep_suspect else marks)
         read = {source: channels[place] for source, place in places.items()}
-        return RawLog(self.name, tuple(paths), read, damage=tuple(damage))
+        return RawLog(self.name, tuple(paths), read, damage=tuple(damage), lost_rows=lost)
 
     def _open(self, paths: Sequence[Path]) -> list[_Table]:
         tables = [_Table(path, self.options) for path in paths]
@@ -165,20 +175,16 @@ def _nothing(path: Path, damage: Sequence[Damage], suspect: int) -> InputError:
     return InputError(f"{path} has no data rows", "check that the log was written to its end")
 
 
+def _damaged(damage: Sequence[Damage]) -> InputError:
+    path, reason = next((one.path, reason) for one in damage for reason in one.reasons)
+    return InputError(reason if str(path) in reason else f"{path} is damaged: {reason}", CURE)
+
+
 def _size(path: Path) -> int:
     try:
         return path.stat().st_size
     except OSError:
         return 0
-
-
-def _mask(stretches: Sequence[tuple[int, int]], size: int) -> NDArray[np.bool_] | None:
-    if not stretches:
-        return None
-    mask = np.zeros(size, dtype=np.bool_)
-    for first, stop in stretches:
-        mask[first:stop] = True
-    return mask
 
 
 class _Column:
@@ -214,22 +220,15 @@ class _Column:
             floats[part] = self._buffer[part].astype(np.float64)
         self._integers = False
 
-    def channel(
-        self,
-        name: str,
-        unit: str | None,
-        good: NDArray[np.bool_] | None,
-        suspect: NDArray[np.bool_] | None,
-    ) -> RawChannel:
-        """Return the samples that are ``good`` (None: all)."""
+    def channel(self, name: str, unit: str | None) -> RawChannel:
+        """Return all samples."""
         exact = None
         if self._integers:
             integers = self._buffer[: self.size]
             if needs_integers(integers):
-                exact = integers.copy() if good is None else integers[good]
+                exact = integers.copy()
             self._become_floats()
-        values = self._buffer.view(np.float64)[: self.size]
-        return RawChannel(name, values if good is None else values[good], {}, unit, exact, suspect)
+        return RawChannel(name, self._buffer.view(np.float64)[: self.size], {}, unit, exact)
 
 
 @dataclass
@@ -238,11 +237,13 @@ class _Account:
 
     path: Path
     line: int
+    offset: int = 0  # samples of the files before
     rows: int = 0
     bad: int = 0
     lost: int | None = 0
     lost_bytes: int = 0
     suspect: list[tuple[int, int]] = field(default_factory=list)
+    gaps: list[tuple[int, int | None]] = field(default_factory=list)  # samples before it, and rows if known
     reasons: list[str] = field(default_factory=list)
     first: InputError | None = None
     _stops: list[tuple[int, int, int]] = field(default_factory=list)
@@ -253,6 +254,7 @@ class _Account:
         for one in rows.bad:
             self._tell(f"{self.path}:{self.line + one.place}: {one.words}", one.hint, bad=True)
         self.lose(len(rows.bad) if not rows.holes else None, rows.holes)
+        self.gaps += [(self.rows + samples, count) for samples, count in rows.gaps]
         self.line += rows.lines
         self.rows += rows.count
         self._stops.append((stop, self.rows, self.bad))
@@ -262,6 +264,8 @@ class _Account:
         place = f":{self.line}" if fault.at_line else ""
         self._tell(f"{self.path}{place}: {fault.words}", CURE)
         self.lose(fault.lost, fault.lost_bytes)
+        if fault.lost != 0:
+            self.gaps.append((self.rows, None))
         if fault.doubt:
             before = [(rows, bad) for end, rows, bad in self._stops if end <= stop - fault.doubt]
             rows, bad = before[-1] if before else (0, 0)
@@ -290,8 +294,10 @@ class _Account:
         reasons = list(self.reasons)
         if self.bad > _TOLD:
             reasons.append(f"{self.path}: {self.bad - _TOLD} more lines cannot be read")
-        mask = _mask(self.suspect, self.rows)
-        suspect = 0 if mask is None else int(np.count_nonzero(mask))
+        mask = np.zeros(self.rows, dtype=np.bool_)
+        for first, stop in self.suspect:
+            mask[first:stop] = True
+        suspect = int(np.count_nonzero(mask))
         return Damage(
             self.path,
             trusted=self.rows - suspect,
@@ -299,6 +305,17 @@ class _Account:
             lost=self.lost,
             lost_bytes=self.lost_bytes,
             reasons=tuple(reasons),
+        )
+
+    def part(self) -> TablePart:
+        """Return where its samples stand among those of all files, and what is missing there."""
+        first = self.offset
+        return TablePart(
+            self.path,
+            first,
+            first + self.rows,
+            [(first + place, count) for place, count in self.gaps],
+            [(first + start, first + stop) for start, stop in self.suspect],
         )
 
 
@@ -316,6 +333,7 @@ class _Table:
         self._line_bytes = len(head) / max(1, head.count(b"\n"))
         self._returns = b"\r" in head
         self._raw = is_like_ascii(self._encoding)
+        self.has_checksum = has_checksum(path)
 
     def place(self, source: str | int) -> int:
         """Return the place of a column, from 0, by name, by the header's text, or by number from 1."""
@@ -348,13 +366,12 @@ class _Table:
     def read(
         self,
         columns: dict[int, _Column],
-        suspect: list[tuple[int, int]],
         options: ReadOptions,
         progress: Progress,
-    ) -> Damage:
-        """Append the samples to ``columns`` and the stretches that may be wrong to ``suspect``."""
-        account = _Account(self.path, self.dialect.first_line)
+    ) -> _Account:
+        """Append the samples to ``columns``, and return what was met."""
         offset = next(iter(columns.values())).size if columns else 0
+        account = _Account(self.path, self.dialect.first_line, offset)
         expected = offset + int(1.02 * _size(self.path) / self._line_bytes) + 64
         import pandas  # noqa: F401, ICN001 - here, for threads must not import it at the same time
 
@@ -365,8 +382,7 @@ class _Table:
                     columns[place].reserve(expected)
                     columns[place].extend(values)
         account.refuse(strict=options.strict, end=True)
-        suspect += [(first + offset, stop + offset) for first, stop in account.suspect]
-        return account.damage()
+        return account
 
     def _rows(
         self, wanted: tuple[int, ...], account: _Account, threads: int | None, advance: Callable[[int], None]

@@ -16,11 +16,10 @@ from flexid_cli.readers.damage import damaged
 from flexid_cli.readers.messages import needs_integers
 from flexid_cli.readers.parts import Decoded
 from flexid_cli.readers.path import Leaf, canonical
-from flexid_cli.readers.plausibility import lone_jumps, misplaced_stamps
+from flexid_cli.readers.plausibility import lone_jumps_in_parts, misplaced_stamps
 
 _LARGEST_START = 1 << 25  # elements; a log that says it holds more may be damaged, and growing costs little
 _SMALLEST = 1024
-_LOOKED_THROUGH = 1 << 20  # samples at once: the statistics need several arrays of that size
 _T = TypeVar("_T", bound=np.generic)
 
 
@@ -158,6 +157,11 @@ class TopicOutput:
         self.doubts: list[Doubt] = []
 
     @property
+    def log_time(self) -> NDArray[np.int64]:
+        """Log times of the messages so far, shape (n,), in ns; not to be kept while there are more to come."""
+        return self._log.view()
+
+    @property
     def size(self) -> int:
         """Number of messages so far."""
         return self._log.size
@@ -181,6 +185,31 @@ class TopicOutput:
         numbers = None if good is None else np.cumsum(good) - 1
         for column in self._columns:
             column.add(decoded, numbers, before, count)
+
+    def spans_without(self, rows: NDArray[np.int64], times: NDArray[np.int64]) -> list[tuple[int, int]]:
+        """Return the times between which lie messages that gave no sample that can be trusted.
+
+        Parameters
+        ----------
+        rows : ndarray of int64, shape (m,)
+            Messages that are not plausible.
+        times : ndarray of int64, shape (k,)
+            Log times of messages that could not be decoded.
+
+        Returns
+        -------
+        list of (int, int)
+            Log times of the trusted messages before and after each of them; without those that have none on
+            one side.
+        """
+        places = np.delete(np.arange(self.size), rows)
+        kept = self.log_time[places]
+        spans = _around(
+            kept, np.searchsorted(places, rows), np.searchsorted(places, rows)
+        )  # times may be wrong
+        kept.sort(kind="stable")
+        spans |= _around(kept, np.searchsorted(kept, times), np.searchsorted(kept, times, side="right"))
+        return sorted(spans)
 
     def _mark(self, suspect: bool, before: int, count: int) -> None:
         if self._suspect is None and suspect:
@@ -267,9 +296,7 @@ class TopicOutput:
         doubtful = np.zeros(channel.values.size, dtype=np.bool_)
         for span in self._unchecked:
             first, end = span if rows is None else np.searchsorted(rows, span).tolist()
-            for start in range(first, end, _LOOKED_THROUGH):
-                part = slice(start, min(start + _LOOKED_THROUGH, end))
-                doubtful[part] = lone_jumps(channel.values[part])
+            doubtful[lone_jumps_in_parts(channel.values[first:end]) + first] = True
         places = np.flatnonzero(doubtful)
         if places.size:
             reason = f"{{count}} samples of {channel.source!r} jump farther than the rest allows"
@@ -305,6 +332,14 @@ def _kept(channel: RawChannel, which: NDArray[np.bool_]) -> RawChannel:
         exact=None if channel.exact is None else channel.exact[which],
         suspect=None if channel.suspect is None else channel.suspect[which],
     )
+
+
+def _around(
+    kept: NDArray[np.int64], before: NDArray[np.intp], after: NDArray[np.intp]
+) -> set[tuple[int, int]]:
+    """The last time of those before, and the first of those from ``after`` on, where both are."""
+    inside = (before > 0) & (after < kept.size)
+    return set(zip(kept[before[inside] - 1].tolist(), kept[after[inside]].tolist(), strict=True))
 
 
 def _chosen(times: NDArray[np.int64], good: NDArray[np.bool_] | None) -> NDArray[np.int64]:

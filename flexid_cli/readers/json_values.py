@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from operator import attrgetter, itemgetter
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, Raw, UnsetType
+from msgspec import UNSET, Meta, Raw, UnsetType
 from numpy.typing import NDArray
 
 from flexid_cli.readers.batch import Batch
@@ -20,9 +20,18 @@ from flexid_cli.readers.path import Leaf, Step
 
 Steps = tuple[Step, ...]
 Stamp = tuple[Steps, Steps]
-_NUMBER = int | float | bool | None
 _NS = 1_000_000_000
 _LAST_SECOND = 9_000_000_000
+# What must be so is said to the parser: it looks at each value anyway, and the message is left to the general
+# decoder where it refuses. Fields without a default are read twice as fast.
+_NUMBER = int | float | bool | None
+_SECONDS = Annotated[int, Meta(ge=-_LAST_SECOND, le=_LAST_SECOND)]
+_NANOSECONDS = Annotated[int, Meta(ge=-_NS * _NS, le=_NS * _NS)]
+_ABSENT = Literal["\0"]  # no number, so it is no stamp either
+_NO_OBJECT = str | int | float | bool | list | None  # type: ignore[type-arg]
+_MAY_LACK = (_ABSENT, _NO_OBJECT)
+_MOST_COUNTED = 64  # elements; an array of known length is read faster than a list
+_FEW = 8  # where more than one message in so many is unlike the first, lengths are no part of the type
 _AT_ONCE = 512  # messages whose objects exist at the same time; more keep the garbage collector busy
 
 
@@ -52,7 +61,9 @@ class TypedJson:
         self._leaves = tuple(leaves)
         self._named = named
         self._general = decode
-        self._types: dict[Stamp | None, _Typed | None] = {}
+        self._types: dict[tuple[Stamp | None, tuple[int, ...]], _Typed | None] = {}
+        self._arrays = list(dict.fromkeys(leaf.steps[:-1] for leaf in leaves if _is_element(leaf)))
+        self._counted = True  # until the arrays' lengths turn out to change
 
     def decode(self, batch: Batch, rows: NDArray[np.int64]) -> tuple[list[Part], NDArray[np.int64]]:
         """Decode those of the messages ``rows`` that are as expected; return also the others.
@@ -62,12 +73,22 @@ class TypedJson:
         InputError
             Names and numbers do not match.
         """
+        parts = self._alike(batch, rows)
+        left = _without(rows, parts)
+        if self._counted and left.size * _FEW > rows.size:
+            self._counted = False
+            more = self._alike(batch, left)
+            parts, left = [*parts, *more], _without(left, more)
+        return parts, left
+
+    def _alike(self, batch: Batch, rows: NDArray[np.int64]) -> list[Part]:
+        """Decode those messages that are of the type of the first."""
         parts: list[Part] = []
         typed = self._type(batch.payload(int(rows[0])))
         if typed is not None:
             for start in range(0, rows.size, _AT_ONCE):
                 parts += self._parts(typed, batch, rows[start : start + _AT_ONCE])
-        return parts, _without(rows, parts)
+        return parts
 
     def _parts(self, typed: _Typed, batch: Batch, rows: NDArray[np.int64]) -> Iterator[Part]:
         objects, members = _decoded(typed, batch, rows)
@@ -80,15 +101,18 @@ class TypedJson:
 
     def _type(self, data: bytes) -> _Typed | None:
         try:
-            stamp = stamp_steps(self._general(data))
+            message = self._general(data)
+            stamp = stamp_steps(message)
         except failures():
             return None
-        if stamp not in self._types:
+        counts = tuple(_count(follow(message, steps)) for steps in self._arrays) if self._counted else ()
+        key = stamp, counts
+        if key not in self._types:
             try:
-                self._types[stamp] = _Typed(self._leaves, stamp)
+                self._types[key] = _Typed(self._leaves, stamp, dict(zip(self._arrays, counts, strict=False)))
             except (NotTypedError, TypeError, ValueError):
-                self._types[stamp] = None
-        return self._types[stamp]
+                self._types[key] = None
+        return self._types[key]
 
     def _part(
         self, typed: _Typed, objects: Sequence[Any], members: NDArray[np.int64], data: bytes
@@ -110,7 +134,7 @@ class TypedJson:
             else:
                 count = len(follow(message, steps[:-1]))
                 taken[leaf] = typed.elements(objects, steps, count, good)
-        stamps = typed.stamps(objects, good)
+        stamps = typed.stamps(objects)
         if not good.any():
             return None
         places = np.flatnonzero(good).tolist() if not good.all() else None
@@ -120,6 +144,15 @@ class TypedJson:
             kept = values if places is None else [values[place] for place in places]
             series[leaf] = listed_series(members, kept)
         return Part(members, series, None if stamps is None else stamps[good])
+
+
+def _is_element(leaf: Leaf) -> bool:
+    return bool(leaf.steps) and isinstance(leaf.steps[-1], int)
+
+
+def _count(array: Any) -> int:
+    """Return the number of elements of an array whose length may be part of the type, else 0."""
+    return len(array) if isinstance(array, list) and len(array) <= _MOST_COUNTED else 0
 
 
 def _decoded(typed: _Typed, batch: Batch, rows: NDArray[np.int64]) -> tuple[list[Any], NDArray[np.int64]]:
@@ -150,6 +183,7 @@ class _Node:
         self.leaf: Any = None
         self.fields: dict[str, _Node] = {}
         self.element: _Node | None = None
+        self.count = 0  # of elements, where all messages have as many
 
     def want(self, steps: Iterable[Step], leaf: Any) -> None:
         node = self
@@ -177,16 +211,24 @@ class _Node:
     def type(self) -> Any:
         if self.leaf is not None:
             return self.leaf
+        if self.element is not None and self.count and self.element.leaf is not None:
+            return tuple[(self.element.leaf,) * self.count]  # type: ignore[misc]
         if self.element is not None:
             return list[self.element.type()]  # type: ignore[misc]
         names = [_attribute(self, name) for name in self.fields]
-        kinds = [node.type() | UnsetType for node in self.fields.values()]
-        return msgspec.defstruct(
-            "Wanted",
-            [(name, kind, UNSET) for name, kind in zip(names, kinds, strict=True)],
-            rename=dict(zip(names, self.fields, strict=True)),
-            gc=False,
-        )
+        fields: list[Any] = []
+        for name, node in zip(names, self.fields.values(), strict=True):
+            kind = node.type()
+            fields.append((name, kind | UnsetType, UNSET) if node.may_lack else (name, kind))
+        rename = dict(zip(names, self.fields, strict=True))
+        return msgspec.defstruct("Wanted", fields, rename=rename, gc=False, kw_only=True)
+
+    @property
+    def may_lack(self) -> bool:
+        """Whether messages need not have it."""
+        if self.leaf is not None:
+            return self.leaf in _MAY_LACK
+        return self.element is None and all(node.may_lack for node in self.fields.values())
 
 
 def _attribute(node: _Node, name: str) -> str:
@@ -196,11 +238,10 @@ def _attribute(node: _Node, name: str) -> str:
 class _Typed:
     """The type of messages with a stamp at one place, and what is taken out of them."""
 
-    def __init__(self, leaves: Sequence[Leaf], stamp: Stamp | None) -> None:
+    def __init__(self, leaves: Sequence[Leaf], stamp: Stamp | None, counts: Mapping[Steps, int]) -> None:
         self._root = _Node()
         self._stamp = stamp
-        self._raw: list[Steps] = []  # must not be there, or be no object: a stamp in them would count first
-        self._absent: list[Steps] = []
+        self._known_getters: dict[Steps, list[Callable[[Any], Any]]] = {}
         for leaf in leaves:
             self._want(leaf.steps, _NUMBER)
         self._names = list(dict.fromkeys(leaf.names for leaf in leaves if leaf.names is not None))
@@ -208,6 +249,10 @@ class _Typed:
             self._want(names, Raw)
         if self._root.leaf is None and self._root.element is None:
             self._want_stamps()
+        for steps, count in counts.items():
+            node = self._root.get(steps)
+            if node is not None:
+                node.count = count
         self.decode = msgspec.json.Decoder(self._root.type()).decode
 
     def _want(self, steps: Steps, leaf: Any) -> None:
@@ -223,14 +268,15 @@ class _Typed:
                 for pair in STAMP_FIELDS:
                     if (*place, pair[0]) == self._stamp[0] and (*place, pair[1]) == self._stamp[1]:
                         break
-                    self._absent += [(*place, name) for name in pair if (*place, name) not in self._stamp]
-                for steps in (*self._stamp, *self._absent):
-                    self._want(steps, _NUMBER if steps in self._stamp else Raw)
+                    for name in pair:
+                        if (*place, name) not in self._stamp:
+                            self._want((*place, name), _ABSENT)
+                self._want(self._stamp[0], _SECONDS)
+                self._want(self._stamp[1], _NANOSECONDS)
                 return
             node = self._root.get(place)
-            if node is None:
-                self._root.want(place, Raw)
-                self._raw.append(place)
+            if node is None:  # an object there may be a stamp, which would count first
+                self._root.want(place, _NO_OBJECT)
             elif node.leaf is None:
                 raise NotTypedError
 
@@ -248,7 +294,7 @@ class _Typed:
             if objects:
                 yield list(everything)
             return
-        raw = [self._got(objects, steps) for steps in self._names]
+        raw = [self._got(objects, steps)[0] for steps in self._names]
         if all(one.count(one[0]) == len(one) for one in raw):
             yield list(everything)
             return
@@ -258,8 +304,8 @@ class _Typed:
 
     def values(self, objects: Sequence[Any], steps: Steps, good: NDArray[np.bool_]) -> list[Any]:
         """Return what stands at ``steps``; clear ``good`` where nothing does."""
-        found = self._got(objects, steps)
-        if UNSET in found:
+        found, complete = self._got(objects, steps)
+        if not complete:
             good &= np.fromiter((value is not UNSET for value in found), np.bool_, len(found))
         return found
 
@@ -267,43 +313,33 @@ class _Typed:
         self, objects: Sequence[Any], steps: Steps, count: int, good: NDArray[np.bool_]
     ) -> list[Any]:
         """Return elements of arrays; clear ``good`` where the array has not ``count`` elements."""
-        arrays = self._got(objects, steps[:-1])
+        arrays, complete = self._got(objects, steps[:-1])
         pick = itemgetter(steps[-1])
-        if UNSET not in arrays and list(map(len, arrays)).count(count) == len(arrays):
+        if complete and list(map(len, arrays)).count(count) == len(arrays):
             return list(map(pick, arrays))
         fit = [one is not UNSET and len(one) == count for one in arrays]
         good &= np.array(fit, dtype=np.bool_)
         return [pick(one) if fits else UNSET for one, fits in zip(arrays, fit, strict=True)]
 
-    def stamps(self, objects: Sequence[Any], good: NDArray[np.bool_]) -> NDArray[np.int64] | None:
-        """Return the messages' stamps; clear ``good`` where one has another kind of stamp than the first."""
-        for steps in self._raw:
-            texts = map(_content, self._got(objects, steps))
-            good &= np.fromiter((text[:1] != b"{" for text in texts), np.bool_, len(objects))
-        for steps in self._absent:
-            good &= np.fromiter((v is UNSET for v in self._got(objects, steps)), np.bool_, len(objects))
+    def stamps(self, objects: Sequence[Any]) -> NDArray[np.int64] | None:
+        """Return the messages' stamps, which are of the kind that the type asks for."""
         if self._stamp is None:
             return None
-        parts = []
-        for steps, limit in zip(self._stamp, (_LAST_SECOND, _NS * _NS), strict=True):
-            found = self._got(objects, steps)
-            if set(map(type, found)) != {int} or max(found) > limit or min(found) < -limit:
-                fit = [type(value) is int and abs(value) <= limit for value in found]
-                good &= np.array(fit, dtype=np.bool_)
-                found = [value if fits else 0 for value, fits in zip(found, fit, strict=True)]
-            parts.append(np.array(found, dtype=np.int64))
-        return parts[0] * _NS + parts[1]
+        seconds, rest = (np.array(self._got(objects, steps)[0], dtype=np.int64) for steps in self._stamp)
+        return seconds * _NS + rest
 
-    def _got(self, objects: Sequence[Any], steps: Steps) -> list[Any]:
-        """Return what stands at ``steps`` in each message, UNSET where nothing does."""
-        getters = list(self._getters(steps))
+    def _got(self, objects: Sequence[Any], steps: Steps) -> tuple[list[Any], bool]:
+        """Return what stands at ``steps`` in each message, UNSET where nothing does, and whether all have it."""
+        if steps not in self._known_getters:
+            self._known_getters[steps] = list(self._getters(steps))
+        getters = self._known_getters[steps]
         found: Iterable[Any] = objects
         for getter in getters:
             found = map(getter, found)
         try:
-            return list(found)
+            return list(found), True
         except (AttributeError, LookupError, TypeError):
-            return [_one(value, getters) for value in objects]
+            return [_one(value, getters) for value in objects], False
 
     def _getters(self, steps: Steps) -> Iterator[Callable[[Any], Any]]:
         node = self._root

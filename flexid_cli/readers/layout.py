@@ -200,24 +200,24 @@ class Layout:
 
     def take(self, batch: Batch, rows: NDArray[np.int64]) -> tuple[Part | None, NDArray[np.int64]]:
         """Decode those of the messages ``rows`` that have this layout; return also the others."""
-        everything = rows.size == batch.starts.size
-        starts, lengths = batch.starts, batch.lengths
-        if not everything:
-            starts, lengths = starts[rows], lengths[rows]
-        fit = lengths == self.length
+        starts, lengths, stride = batch.starts, batch.lengths, batch.stride
+        if rows.size != starts.size:
+            starts, lengths, stride = starts[rows], lengths[rows], 0
         others = rows[:0]
+        # one element that stands for all is compared once
+        fit = (lengths[:1] if lengths.strides == (0,) else lengths) == self.length
         if not fit.all():
             if not fit.any():
                 return None, rows
-            others, rows, starts = rows[~fit], rows[fit], starts[fit]
-        payloads = Payloads(batch.buffer, starts)
+            others, rows, starts, stride = rows[~fit], rows[fit], starts[fit], 0
+        payloads = Payloads(batch.buffer, starts, stride).gathered(self.length)
         agreeing = agreement(self.shape, payloads)
         if agreeing is not None:
             others = np.sort(np.concatenate([others, rows[~agreeing]]))
             rows = rows[agreeing]
             if not rows.size:
                 return None, others
-            payloads = Payloads(batch.buffer, starts[agreeing])
+            payloads = payloads.chosen(agreeing)
         return self._read(payloads, rows), others
 
     def _read(self, payloads: Payloads, members: NDArray[np.int64]) -> Part:

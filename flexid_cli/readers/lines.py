@@ -7,13 +7,13 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from flexid_cli.readers.dialect import Dialect, is_whole, split_line
 from flexid_cli.readers.packed import Fault
 
 T = TypeVar("T")
-_BLOCK = 1 << 20  # bytes of text parsed at once
+_BLOCK = 1 << 20  # bytes of text parsed at once; the parser takes longer with less, and more memory with more
 _CHECKED = 1 << 18  # bytes that are worth a block of their own
 _LONGEST_LINE = 1 << 20
 _TAIL = 1 << 12  # bytes of the last lines, to judge the very last by
@@ -170,20 +170,58 @@ class Cutter:
 def in_order(
     parse: Callable[[bytes], T], items: Iterable[Block | Fault], threads: int
 ) -> Generator[tuple[T, int] | Fault]:
-    """Parse blocks in threads, a few of them at a time, and yield the results in order."""
+    """Parse blocks in threads, a few of them at a time, and yield the results in order.
+
+    The thread that takes the results is one of them: one more would stand in its way.
+    """
     if threads == 1:
         for item in items:
             yield item if isinstance(item, Fault) else (parse(item.text), item.stop)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        waiting: deque[tuple[Future[T], int] | Fault] = deque()
+    with ThreadPoolExecutor(threads - 1) as pool:
+        waiting: deque[_Ahead[T] | Fault] = deque()
         for item in items:
-            waiting.append(item if isinstance(item, Fault) else (pool.submit(parse, item.text), item.stop))
-            while len(waiting) > threads:
-                yield _finished(waiting.popleft())
+            if isinstance(item, Fault):
+                waiting.append(item)
+            else:
+                waiting.append(_Ahead(item, pool.submit(parse, item.text)))
+            while len(waiting) >= threads:
+                yield _next(waiting, parse)
         while waiting:
-            yield _finished(waiting.popleft())
+            yield _next(waiting, parse)
 
 
-def _finished(item: tuple[Future[T], int] | Fault) -> tuple[T, int] | Fault:
-    return item if isinstance(item, Fault) else (item[0].result(), item[1])
+class _Ahead(Generic[T]):
+    """A block that waits for its turn; a thread parses it, if nobody else does before."""
+
+    def __init__(self, block: Block, future: Future[T]) -> None:
+        self.stop = block.stop
+        self._text = [block.text]
+        self.future = future
+        self.result: list[T] = []
+
+    def parse(self, parse: Callable[[bytes], T]) -> None:
+        """Parse the block here, unless a thread has begun to."""
+        if self.future.cancel():
+            self.result.append(parse(self._text.pop()))
+        else:
+            self._text.clear()  # the thread that parses it lets go of it in its turn
+
+    @property
+    def is_done(self) -> bool:
+        return bool(self.result) or self.future.done()
+
+
+def _next(waiting: deque[_Ahead[T] | Fault], parse: Callable[[bytes], T]) -> tuple[T, int] | Fault:
+    """Take the first result; until it is there, parse blocks that no thread has begun with."""
+    first = waiting[0]
+    if isinstance(first, Fault):
+        waiting.popleft()
+        return first
+    for ahead in waiting:
+        if first.is_done:
+            break
+        if isinstance(ahead, _Ahead) and not ahead.result:
+            ahead.parse(parse)
+    waiting.popleft()
+    return first.result[0] if first.result else first.future.result(), first.stop

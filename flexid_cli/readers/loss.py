@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
 
 _MOST_REASONS = 20  # a file that is damaged everywhere needs no longer list
 
@@ -47,3 +51,39 @@ class Loss:
     def any(self) -> bool:
         """Whether anything is damaged."""
         return bool(self.reasons)
+
+
+class TimeGaps:
+    """Finds the times between which messages are lost, from those that follow each other in a file.
+
+    Parameters
+    ----------
+    loss : Loss
+        Gets the spans.
+    """
+
+    def __init__(self, loss: Loss) -> None:
+        self._loss = loss
+        self._last: int | None = None
+        self._is_open = False
+
+    def take(self, times: NDArray[np.int64], places: Sequence[int] = ()) -> None:
+        """Take the next messages that can be trusted.
+
+        Parameters
+        ----------
+        times : ndarray of int64, shape (n,)
+            Their log times in ns, in the order of the file.
+        places : sequence of int
+            Numbers of the messages before which something is missing, from 0; n: after the last.
+        """
+        if not times.size:
+            self._is_open |= bool(places)
+            return
+        inside = {place for place in places if place < times.size}
+        for place in sorted(inside | ({0} if self._is_open else set())):
+            before = int(times[place - 1]) if place else self._last
+            if before is not None and before < times[place]:
+                self._loss.spans_ns.append((before, int(times[place])))
+        self._last = int(times[-1])
+        self._is_open = len(inside) < len(set(places))

@@ -14,6 +14,7 @@ from flexid_cli.readers.loss import Loss
 from flexid_cli.readers.mcap_pass import McapPass
 from flexid_cli.readers.mcap_probe import probe
 from flexid_cli.readers.mcap_records import MAGIC
+from flexid_cli.readers.mcap_summary import Summary, read_summary
 
 _LEAST_MAGIC = 6  # bytes of the magic that a damaged file must still have
 
@@ -77,16 +78,26 @@ class McapFile:
         self._file = path
         self._options = options
         self._progress = progress
+        self._summary: tuple[int, Summary] | None = None
 
     def probe(self) -> Probe:
         """Count the messages and take the first ones of every topic, with as little reading as it needs."""
         self.loss = Loss()
         with ByteSource(self._file, self.path) as source:
-            return probe(source, self.loss)
+            return probe(source, self.loss, self._read_summary(source))
 
     def batches(self, wanted: Callable[[str], bool], window: Window) -> Iterator[Batch]:
         """Yield the messages of the wanted topics, chunk by chunk; see `Container`."""
         self.loss = Loss()
         with ByteSource(self._file, self.path) as source:
-            reading = McapPass(source, self.loss, wanted, window, self._options.threads, self._progress)
+            summary = self._read_summary(source)
+            reading = McapPass(
+                source, self.loss, wanted, window, self._options.threads, self._progress, summary
+            )
             yield from reading.batches()
+
+    def _read_summary(self, source: ByteSource) -> Summary:
+        """Return the end of the file, which is read again where the file has grown."""
+        if self._summary is None or self._summary[0] != source.size:
+            self._summary = source.size, read_summary(source)
+        return self._summary[1]

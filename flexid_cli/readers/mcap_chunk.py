@@ -7,8 +7,7 @@ unpacking and the checksum let go of the interpreter.
 from __future__ import annotations
 
 import threading
-import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flexid_cli.readers.byte_source import ByteSource
+from flexid_cli.readers.checksum import crc32
 from flexid_cli.readers.damage import explain, failures
 from flexid_cli.readers.mcap_records import (
     CODECS,
@@ -23,6 +23,7 @@ from flexid_cli.readers.mcap_records import (
     Chunk,
     Located,
     by_index,
+    by_picks,
     even,
     index_offsets,
     locate,
@@ -38,6 +39,8 @@ _ZSTD_MAGIC, _LZ4_MAGIC = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
 _LARGEST_WINDOW = 1 << 27  # bytes; what the reference decoder allows, too
 _UNKNOWN_SIZE = (1 << 64) - 1
 _own = threading.local()
+
+Picks = Sequence[tuple[int, int, int]]
 
 
 class Trust(Enum):
@@ -73,11 +76,28 @@ class Unpacked:
     counts: dict[int, int]
 
 
-def unpack(source: ByteSource, chunk: Chunk, index_end: int) -> Unpacked:
-    """Read, unpack and verify ``chunk``, whose message index records end at byte ``index_end``."""
+def unpack(source: ByteSource, chunk: Chunk, index_end: int, picks: Picks | None = None) -> Unpacked:
+    """Read, unpack and verify a chunk.
+
+    Parameters
+    ----------
+    source : ByteSource
+        The file.
+    chunk : Chunk
+        Where it stands.
+    index_end : int
+        End of its message index records.
+    picks : sequence of (int, int, int), optional
+        Channels whose messages are all that is wanted, with the first byte and the end of their message index
+        record in the file, by a summary whose checksum holds. Others are left out where that can be verified.
+    """
     packed = source.read(chunk.start, chunk.packed)
     records, reason = _decompress(chunk, packed)
-    sound = bool(records) and chunk.checksum != 0 and zlib.crc32(records) == chunk.checksum
+    sound = bool(records) and chunk.checksum != 0 and crc32(records) == chunk.checksum
+    if sound and picks is not None and len(records) == chunk.size and chunk.codec in CODECS:
+        messages = _picked(source, chunk, index_end, records, picks)
+        if messages is not None:
+            return Unpacked(records, messages, Trust.CHECKED, "", {})
     may_be_whole = sound or (not reason and chunk.checksum == 0 and len(records) == chunk.size)
     messages = even(records) if may_be_whole else None
     counts: dict[int, int] = {}
@@ -97,6 +117,13 @@ def unpack(source: ByteSource, chunk: Chunk, index_end: int) -> Unpacked:
     if chunk.is_cut and not chunk.checksum and chunk.codec == "":
         return Unpacked(records, messages, Trust.UNCHECKED, reason, counts)
     return Unpacked(records, messages, Trust.SUSPECT, reason, counts)
+
+
+def _picked(source: ByteSource, chunk: Chunk, index_end: int, records: bytes, picks: Picks) -> Located | None:
+    index = source.read(chunk.end, index_end - chunk.end)
+    return by_picks(
+        records, index, [(channel, first - chunk.end, end - chunk.end) for channel, first, end in picks]
+    )
 
 
 def _oddity(chunk: Chunk, messages: Located, records: bytes) -> str:

@@ -17,10 +17,10 @@ from flexid_cli.readers.base import Progress, Window
 from flexid_cli.readers.batch import Batch
 from flexid_cli.readers.byte_source import ByteSource
 from flexid_cli.readers.loss import Loss
-from flexid_cli.readers.mcap_chunk import Trust, Unpacked, unpack
+from flexid_cli.readers.mcap_chunk import Picks, Trust, Unpacked, unpack
 from flexid_cli.readers.mcap_records import MAGIC, Chunk, Located, index_times
 from flexid_cli.readers.mcap_salvage import Seeker
-from flexid_cli.readers.mcap_summary import data_checksum_holds, read_summary
+from flexid_cli.readers.mcap_summary import Summary, data_checksum_holds, read_summary
 from flexid_cli.readers.mcap_topics import Described, Level, Topics
 from flexid_cli.readers.mcap_walk import ChunkPiece, HolePiece, LoosePiece, Piece, Walk
 from flexid_cli.readers.memory import keep_freed_memory
@@ -42,6 +42,15 @@ class _Found:
     checked: bool
 
 
+@dataclass
+class _Ahead:
+    """A piece that waits for its turn; its chunk is unpacked, or a thread will do that."""
+
+    piece: Piece
+    future: Future[Unpacked] | None
+    unpacked: Unpacked | None = None
+
+
 class McapPass:
     """One pass through a file.
 
@@ -59,6 +68,8 @@ class McapPass:
         That unpack chunks; None takes one per core.
     progress : Progress, optional
         Is told what has been read.
+    summary : Summary, optional
+        The end of the file, where it was read before.
     """
 
     def __init__(
@@ -69,13 +80,14 @@ class McapPass:
         window: Window,
         threads: int | None,
         progress: Progress | None = None,
+        summary: Summary | None = None,
     ) -> None:
         self._source = source
         self._loss = loss
         self._window = window
         self._threads = threads or os.cpu_count() or 1
         self._progress = progress
-        self._summary = read_summary(source)
+        self._summary = summary or read_summary(source)
         self._topics = Topics(self._summary, wanted)
         self._seeker = Seeker(source, set(self._summary.channels))
         self._walk = Walk(source, self._summary, self._seeker, self._skips)
@@ -94,10 +106,11 @@ class McapPass:
         if self._source.read(0, len(MAGIC)) != MAGIC:
             self._loss.add("its first bytes are not those of an MCAP file")
         for piece, unpacked in self._read():
-            for found in self._take(piece, unpacked):
-                for batch in self._sorted(found):
-                    self._note(batch)
-                    yield batch
+            for batch in self._messages(piece, unpacked):
+                self._note(batch)
+                yield batch
+                del batch
+            del unpacked  # its memory, still in the processor's cache, is the next chunk's
             end = piece.end if isinstance(piece, HolePiece) else _end_of(piece)
             self._advance(end - done)
             done = max(done, end)
@@ -116,31 +129,58 @@ class McapPass:
         return self._walk.pieces()
 
     def _read(self) -> Iterator[Read]:
-        """Yield the pieces in order, their chunks unpacked by some threads ahead of the one in use."""
+        """Yield the pieces in order, their chunks unpacked by some threads ahead of the one in use.
+
+        This thread, which decodes the messages, is one of them: one more would stand in its way.
+        """
         if self._threads == 1:
             for piece in self._pieces():
                 yield piece, self._unpack(piece) if isinstance(piece, ChunkPiece) else None
             return
-        waiting: deque[tuple[Piece, Future[Unpacked] | None]] = deque()
+        waiting: deque[_Ahead] = deque()
         size = 0
-        with ThreadPoolExecutor(self._threads, "flexid-unpack") as pool:
+        with ThreadPoolExecutor(self._threads - 1, "flexid-unpack") as pool:
             try:
                 for piece in self._pieces():
                     chunk = piece if isinstance(piece, ChunkPiece) else None
-                    waiting.append((piece, None if chunk is None else pool.submit(self._unpack, chunk)))
+                    waiting.append(_Ahead(piece, None if chunk is None else pool.submit(self._unpack, chunk)))
                     size += _size_of(piece)
                     while len(waiting) > self._threads + 1 or (size > _MOST_IN_FLIGHT and len(waiting) > 1):
-                        size -= _size_of(waiting[0][0])
-                        yield _result(waiting.popleft())
+                        size -= _size_of(waiting[0].piece)
+                        yield self._next(waiting)
                 while waiting:
-                    yield _result(waiting.popleft())
+                    yield self._next(waiting)
             finally:
-                for _, future in waiting:
-                    if future is not None:
-                        future.cancel()
+                for ahead in waiting:
+                    if ahead.future is not None:
+                        ahead.future.cancel()
+
+    def _next(self, waiting: deque[_Ahead]) -> Read:
+        """Take the first of the pieces; until its chunk is unpacked, unpack those that no thread has begun."""
+        first = waiting[0]
+        for ahead in waiting:
+            if first.future is None or first.future.done():
+                break
+            if ahead.future is not None and ahead.future.cancel() and isinstance(ahead.piece, ChunkPiece):
+                ahead.future, ahead.unpacked = None, self._unpack(ahead.piece)
+        waiting.popleft()
+        return first.piece, first.unpacked if first.future is None else first.future.result()
 
     def _unpack(self, piece: ChunkPiece) -> Unpacked:
-        return unpack(self._source, piece.chunk, piece.index_end)
+        return unpack(self._source, piece.chunk, piece.index_end, self._picks(piece.chunk))
+
+    def _picks(self, chunk: Chunk) -> Picks | None:
+        """Return where a checked summary places the index of all that is wanted of a chunk.
+
+        None where all of the chunk is wanted, or where the summary does not describe all of its channels.
+        """
+        entry = self._summary.chunks.get(chunk.position) if self._summary.lists_all else None
+        if entry is None or entry.channels <= self._wanted_by_summary:
+            return None
+        places = entry.indexes
+        if places is None or not entry.channels <= self._summary.channels.keys():
+            return None
+        return [(channel, *places[channel]) for channel in entry.channels & self._wanted_by_summary] or None
 
     def _skips(self, chunk: Chunk) -> bool:
         """Whether a chunk holds nothing that is wanted; damaged times in its head must not hide it."""
@@ -164,6 +204,36 @@ class McapPass:
         return self._topics.wanted_channels()
 
     # --- from pieces to messages ----------------------------------------------------------------------
+
+    def _messages(self, piece: Piece, unpacked: Unpacked | None) -> Iterator[Batch]:
+        plain = self._plain(piece, unpacked)
+        if plain is not None:
+            yield plain
+            return
+        for found in self._take(piece, unpacked):
+            yield from self._sorted(found)
+
+    def _plain(self, piece: Piece, unpacked: Unpacked | None) -> Batch | None:
+        """Return the messages of a sound chunk where they are of one channel and all there is, else None."""
+        if unpacked is None or unpacked.trust is not Trust.CHECKED or unpacked.reason:
+            return None
+        messages = unpacked.messages
+        if messages.channel is None or messages.others or not isinstance(piece, ChunkPiece) or piece.reason:
+            return None
+        described = self._topics.get(messages.channel)
+        if described is None or not described.wanted or not described.trusted:
+            return None
+        self._met_chunks = self._met_checksums = True
+        return Batch(
+            kind=described.kind,
+            buffer=np.frombuffer(unpacked.buffer, dtype=np.uint8),
+            starts=messages.starts,
+            lengths=messages.lengths,
+            log_time=messages.log_time,
+            publish_time=messages.publish_time,
+            checked=True,
+            stride=messages.stride,
+        )
 
     def _take(self, piece: Piece, unpacked: Unpacked | None) -> Iterator[_Found]:
         if isinstance(piece, HolePiece):
@@ -261,7 +331,7 @@ class McapPass:
         messages = found.messages
         if not messages.count:
             return
-        numbers = _distinct(messages.channels)
+        numbers = _distinct(messages.channels) if messages.channel is None else [messages.channel]
         described = {number: self._described(number, messages) for number in numbers}
         by_topic: dict[str, list[int]] = {}
         for number, one in described.items():
@@ -327,6 +397,7 @@ class McapPass:
                 publish_time=_rows(messages.publish_time, part),
                 trusted=is_trusted and described.trusted,
                 checked=found.checked,
+                stride=messages.stride if part is None else 0,
             )
             if batch.starts.size:
                 yield batch
@@ -399,11 +470,6 @@ class _Gap:
         if begin is not None and until_ns is not None and until_ns > begin:
             self._loss.spans_ns.append((begin, until_ns))
         self._is_open, self._reached, self._first_suspect = False, None, None
-
-
-def _result(entry: tuple[Piece, Future[Unpacked] | None]) -> Read:
-    piece, future = entry
-    return piece, None if future is None else future.result()
 
 
 def _distinct(values: NDArray[np.int64]) -> list[int]:

@@ -21,7 +21,7 @@ _LOOKED_AT_BYTES = 1 << 20
 _LEVELS = {Trust.CHECKED: Level.CHECKED, Trust.UNCHECKED: Level.UNCHECKED, Trust.SUSPECT: Level.SUSPECT}
 
 
-def probe(source: ByteSource, loss: Loss) -> Probe:
+def probe(source: ByteSource, loss: Loss, summary: Summary | None = None) -> Probe:
     """Look at an open file.
 
     Where the summary is sound, only the chunks with the first messages of each topic are read; else the
@@ -33,8 +33,10 @@ def probe(source: ByteSource, loss: Loss) -> Probe:
         The file.
     loss : Loss
         Takes up what is damaged.
+    summary : Summary, optional
+        The end of the file, where it was read before.
     """
-    summary = read_summary(source)
+    summary = summary or read_summary(source)
     look = _Look(source, summary, loss)
     if summary.knows_counts:
         look.take_samples()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import struct
 from array import array
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +16,13 @@ HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = ra
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
 RECORD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
+INDEX_HEAD = struct.Struct("<BQHI")
 LARGEST_CHUNK = 1 << 30  # bytes; writers use 1 to 8 MiB
 CODECS = ("", "zstd", "lz4")
 
 _CHUNK_HEAD = struct.Struct("<QQQI")
+_PAIR = struct.Struct("<HQ")
+_FOUR = struct.Struct("<QQQQ")
 _LONGEST_CODEC = 32
 CHUNK_HEAD_BYTES = RECORD.size + _CHUNK_HEAD.size + 4 + _LONGEST_CODEC + 8
 _LEAST = (0, 8, 20, 12, 12, 22, 40, 6, 64, 28, 42, 42, 8, 20, 17, 4)  # bytes of a body, by opcode
@@ -32,6 +36,8 @@ _HEAD = np.dtype(
     }
 )
 _OPAQUE = np.dtype(f"V{_MESSAGE_BYTES}")  # numpy copies plain bytes several times as fast as fields
+_WORDS_OF_A_HEAD = (0, 3)  # eight bytes each: together opcode, length and channel
+_WORD, _TIME = np.dtype("<u8"), np.dtype("<i8")
 _FIRST_LOOK, _LOOK_GROWTH, _LONGEST_LOOK = 16, 8, 1 << 14
 
 Bytes = bytes | memoryview
@@ -100,6 +106,19 @@ class ChunkIndex:
     last_ns: int
     channels: frozenset[int]
     index_bytes: int
+    places: dict[int, int] = field(default_factory=dict)
+
+    @cached_property
+    def indexes(self) -> dict[int, tuple[int, int]] | None:
+        """First byte and end of each channel's message index record; None where they are no such records."""
+        end = self.position + self.length + self.index_bytes
+        found: dict[int, tuple[int, int]] = {}
+        for channel, place in sorted(self.places.items(), key=lambda pair: -pair[1]):
+            if end - place < RECORD.size + 6 or (end - place - RECORD.size - 6) % 16:
+                return None
+            found[channel] = place, end
+            end = place
+        return found if end == self.position + self.length else None
 
     @property
     def messages(self) -> int:
@@ -150,13 +169,12 @@ class _Fields:
     def text(self) -> str:
         return self.bytes(self.number(4)).decode("utf-8")
 
-    def pairs(self, key: int, value: int) -> dict[int, int]:
-        inner = _Fields(self.bytes(self.number(4)))
-        found = {}
-        while not inner.is_done:
-            name = inner.number(key)
-            found[name] = inner.number(value)
-        return found
+    def pairs(self) -> dict[int, int]:
+        """Numbers of channels, and what belongs to them."""
+        content = self.bytes(self.number(4))
+        if len(content) % _PAIR.size:
+            raise ValueError("a pair goes beyond its record")
+        return dict(_PAIR.iter_unpack(content))
 
     @property
     def is_done(self) -> bool:
@@ -190,9 +208,9 @@ def parse_channel(body: Bytes) -> tuple[int, Channel]:
 def parse_chunk_index(body: Bytes) -> ChunkIndex:
     """Return the content of a chunk index record; raises ValueError where the body cannot be one."""
     fields = _Fields(body)
-    first, last, position, length = (fields.number(8) for _ in range(4))
-    channels = frozenset(fields.pairs(2, 8))
-    return ChunkIndex(position, length, first, last, channels, fields.number(8))
+    first, last, position, length = _FOUR.unpack(fields.bytes(_FOUR.size))
+    places = fields.pairs()
+    return ChunkIndex(position, length, first, last, frozenset(places), fields.number(8), places)
 
 
 def parse_statistics(body: Bytes) -> Statistics:
@@ -201,7 +219,7 @@ def parse_statistics(body: Bytes) -> Statistics:
     messages = fields.number(8)
     fields.bytes(2 + 4 + 4 + 4)  # numbers of schemas, channels, attachments, metadata
     statistics = Statistics(messages, fields.number(4), fields.number(8), fields.number(8))
-    statistics.counts = fields.pairs(2, 8)
+    statistics.counts = fields.pairs()
     return statistics
 
 
@@ -251,6 +269,10 @@ class Located:
         Opcode, first byte and end of the body of each schema and channel record.
     stop : int
         Where the walk ended: the end of the buffer, or the first byte that begins no record.
+    channel : int or None
+        The channel of all messages, where it is known that they have only one.
+    stride : int
+        Bytes from one message to the next, where it is known that it is always the same, else 0.
     """
 
     channels: Integers
@@ -260,6 +282,8 @@ class Located:
     publish_time: Integers
     others: tuple[tuple[int, int, int], ...]
     stop: int
+    channel: int | None = None
+    stride: int = 0
 
     @property
     def count(self) -> int:
@@ -372,11 +396,86 @@ def even(buffer: Bytes) -> Located | None:
     stride = RECORD.size + length
     if length < MESSAGE_HEAD.size or (size - place) % stride:
         return None
-    offsets = np.arange(place, size, stride, dtype=np.int64)
+    count = (size - place) // stride
+    for offset in _WORDS_OF_A_HEAD:
+        words = np.ndarray((count,), _WORD, buffer, place + offset, (stride,))
+        if not (words == words[0]).all():
+            return _even_mixed(buffer, place, stride, tuple(others))
+    channel = int.from_bytes(buffer[place + 9 : place + 11], "little")
+    return Located(
+        channels=_constant(channel, count),
+        starts=np.arange(place + _MESSAGE_BYTES, size + _MESSAGE_BYTES, stride, dtype=np.int64),
+        lengths=_constant(length - MESSAGE_HEAD.size, count),
+        log_time=np.ndarray((count,), _TIME, buffer, place + 15, (stride,)),
+        publish_time=np.ndarray((count,), _TIME, buffer, place + 23, (stride,)),
+        others=tuple(others),
+        stop=size,
+        channel=channel,
+        stride=stride,
+    )
+
+
+def _even_mixed(
+    buffer: Bytes, place: int, stride: int, others: tuple[tuple[int, int, int], ...]
+) -> Located | None:
+    """Locate messages of one length and several channels; None where they have several lengths."""
+    offsets = np.arange(place, len(buffer), stride, dtype=np.int64)
     heads = _heads(buffer, offsets)
-    if not ((heads["opcode"] == MESSAGE) & (heads["length"] == length)).all():
+    if not ((heads["opcode"] == MESSAGE) & (heads["length"] == stride - RECORD.size)).all():
         return None
-    return _located(heads, offsets, tuple(others), size)
+    return _located(heads, offsets, others, len(buffer))
+
+
+def _constant(value: int, count: int) -> Integers:
+    """Return an array that has the same element everywhere, and memory for one."""
+    return np.ndarray((count,), np.int64, np.array([value], dtype=np.int64), 0, (0,))
+
+
+def by_picks(buffer: Bytes, index: bytes, picks: Iterable[tuple[int, int, int]]) -> Located | None:
+    """Locate the messages of some channels by their message index records; None where these are wrong.
+
+    Right are offsets at which different messages of their channel begin that have the log times of the index
+    and do not overlap. As the number of entries is that of a checked summary, no message is missing.
+
+    Parameters
+    ----------
+    buffer : bytes
+        The records of a chunk, whose checksum holds.
+    index : bytes
+        The message index records after it.
+    picks : iterable of (int, int, int)
+        Channel, and first byte and end of its record in ``index``.
+    """
+    size = len(buffer)
+    channels = []
+    pairs = []
+    for channel, first, end in picks:
+        head = (MESSAGE_INDEX, end - first - RECORD.size, channel, end - first - RECORD.size - 6)
+        if end > len(index) or INDEX_HEAD.unpack_from(index, first) != head:
+            return None
+        pairs.append(np.frombuffer(index[first + INDEX_HEAD.size : end], dtype="<i8").reshape(-1, 2))
+        channels.append(channel)
+    numbers: Integers | int
+    if len(pairs) == 1:
+        entries, numbers = pairs[0], channels[0]
+    else:
+        entries = np.concatenate(pairs)
+        numbers = np.repeat(channels, [len(part) for part in pairs])
+        order = np.argsort(entries[:, 1], kind="stable")
+        entries, numbers = entries[order], numbers[order]
+    times, offsets = entries[:, 0], entries[:, 1].astype(np.int64)
+    if not offsets.size or offsets.min() < 0 or offsets.max() > size - _MESSAGE_BYTES:
+        return None
+    heads = _heads(buffer, offsets)
+    lengths = heads["length"]
+    right = (heads["opcode"] == MESSAGE) & (heads["channel"] == numbers) & (heads["log_time"] == times)
+    if not right.all() or lengths.min() < MESSAGE_HEAD.size or lengths.max() > size:
+        return None
+    ends = offsets + lengths + RECORD.size
+    if int(ends[-1]) > size or not (offsets[1:] >= ends[:-1]).all():
+        return None
+    located = _located(heads, offsets, (), size)
+    return replace(located, channel=channels[0]) if len(pairs) == 1 else located
 
 
 def by_index(buffer: Bytes, offsets: Integers) -> Located | None:

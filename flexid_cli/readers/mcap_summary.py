@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, field
 from functools import cached_property
 
 from flexid_cli.readers.byte_source import ByteSource
+from flexid_cli.readers.checksum import crc32
 from flexid_cli.readers.mcap_records import (
     CHANNEL,
     CHUNK_INDEX,
@@ -88,7 +88,7 @@ def read_summary(source: ByteSource) -> Summary:
     content = source.read(begin, end - begin) if begin else b""
     summary = Summary()
     if stored:
-        summary.is_checked = zlib.crc32(tail[:25], zlib.crc32(content)) == stored
+        summary.is_checked = crc32(tail[:25], crc32(content)) == stored
         if not summary.is_checked:
             return Summary(problem="the checksum of its summary is wrong")
     try:
@@ -135,5 +135,5 @@ def data_checksum_holds(source: ByteSource, summary: Summary) -> bool | None:
         return None
     checksum, block = 0, 1 << 20
     for start in range(0, summary.data_end, block):
-        checksum = zlib.crc32(source.read(start, min(block, summary.data_end - start)), checksum)
+        checksum = crc32(source.read(start, min(block, summary.data_end - start)), checksum)
     return checksum == summary.data_checksum

@@ -13,6 +13,7 @@ from flexid_cli.readers.mcap_records import (
     CODECS,
     DATA_END,
     FOOTER,
+    INDEX_HEAD,
     LARGEST_CHUNK,
     MAGIC,
     MESSAGE,
@@ -108,7 +109,7 @@ class Walk:
             chunk = self._chunk(head, place)
             if chunk is not None:
                 self._after_hole = False
-                place = self._index_end(chunk.chunk.end)
+                place = self._index_end(chunk.chunk)
                 if not self._skips(chunk.chunk):
                     yield replace(chunk, index_end=place)
             elif len(head) >= RECORD.size and head[0] in {SCHEMA, CHANNEL, MESSAGE}:
@@ -135,7 +136,7 @@ class Walk:
             if piece is None:
                 yield HolePiece(place, end, f"there is no chunk at byte {place}, where the index says")
             else:
-                yield replace(piece, index_end=self._index_end(piece.chunk.end))
+                yield replace(piece, index_end=self._index_end(piece.chunk))
 
     def _is_end(self, place: int) -> bool:
         """Whether the data section ends at ``place``; notes what follows the file's own end."""
@@ -214,8 +215,30 @@ class Walk:
             return True
         return self._chunk(self._source.peek(place, CHUNK_HEAD_BYTES), place) is not None
 
-    def _index_end(self, place: int) -> int:
-        """Return the end of the message index records from ``place`` on."""
+    def _known_index_end(self, chunk: Chunk) -> int | None:
+        """Return the end of its message index records, where they are what a checked summary says; else None."""
+        entry = self._summary.chunks.get(chunk.position) if self._summary.lists_all else None
+        if entry is None or entry.position + entry.length != chunk.end or entry.indexes is None:
+            return None
+        for channel, (first, end) in entry.indexes.items():
+            head = self._source.peek(first, INDEX_HEAD.size)
+            size = end - first - INDEX_HEAD.size
+            if head != INDEX_HEAD.pack(MESSAGE_INDEX, size + 6, channel, size):
+                return None
+        end = chunk.end + entry.index_bytes
+        following = self._summary.chunks.get(end)
+        if following is not None and self._source.peek(end, RECORD.size) == RECORD.pack(
+            CHUNK, following.length - RECORD.size
+        ):
+            return end
+        return end if self._goes_on(end) else None
+
+    def _index_end(self, chunk: Chunk) -> int:
+        """Return the end of the message index records after a chunk."""
+        known = self._known_index_end(chunk)
+        if known is not None:
+            return known
+        place = chunk.end
         while True:
             head = self._source.peek(place, RECORD.size + 6)
             if len(head) < RECORD.size + 6 or head[0] != MESSAGE_INDEX:

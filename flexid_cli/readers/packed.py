@@ -10,13 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from flexid_cli.readers.checksum import crc32
 from flexid_cli.readers.damage import explain, unreadable
 
 GZIP_MAGIC = b"\x1f\x8b"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _MEMBER = b"\x1f\x8b\x08"
 _READ = 1 << 20
-_BLOCK = 1 << 20
+_BLOCK = 1 << 19
 _PACKED = 1 << 16  # bytes given to zlib at once: what is lost where it fails
 _PLAIN = 1 << 19  # bytes taken from zlib at once, however well they were packed
 _TRIED = 1 << 12
@@ -131,6 +132,18 @@ def pieces(path: Path, advance: Callable[[int], None]) -> Generator[bytes | Faul
         raise unreadable(path, error) from error
 
 
+def has_checksum(path: Path) -> bool:
+    """Whether a checksum covers the text of a file: always with gzip, with zstd where its first frame says so."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(5)
+    except OSError as error:
+        raise unreadable(path, error) from error
+    return head.startswith(GZIP_MAGIC) or (
+        head.startswith(ZSTD_MAGIC) and len(head) == 5 and bool(head[4] & 4)
+    )
+
+
 # --- gzip (RFC 1952) ------------------------------------------------------------
 
 
@@ -204,7 +217,7 @@ def _inflated(feed: _Feed) -> Iterator[bytes | Fault]:
         if not packed and not plain:
             yield Fault("the file is cut short; what comes before was read")
             return
-        crc, size = zlib.crc32(plain, crc), size + len(plain)
+        crc, size = crc32(plain, crc), size + len(plain)
         if plain:
             yield plain
     feed.back(body.unused_data)

@@ -102,6 +102,8 @@ def listed_series(rows: NDArray[np.int64], values: Sequence[Any]) -> Series:
 
 def join(count: int, parts: Sequence[Part], reason: str = "") -> Decoded:
     """Put the parts of a batch of ``count`` messages together; messages in no part are bad."""
+    if len(parts) == 1 and parts[0].members.size == count:
+        return _whole_part(parts[0])
     found = sum(part.members.size for part in parts)
     bad = np.zeros(count, dtype=np.bool_)
     if found < count:
@@ -121,11 +123,19 @@ def join(count: int, parts: Sequence[Part], reason: str = "") -> Decoded:
     return decoded
 
 
+def _whole_part(part: Part) -> Decoded:
+    """Return a part that holds all messages of its batch."""
+    decoded = Decoded({}, {}, part.stamps, np.zeros(part.members.size, dtype=np.bool_))
+    for leaf, (rows, values, integral, exact) in part.series.items():
+        decoded.values[leaf], decoded.rows[leaf], decoded.integral[leaf] = values, rows, integral
+        if exact is not None:
+            decoded.exact[leaf] = exact
+    return decoded
+
+
 def _stamps(count: int, parts: Sequence[Part]) -> NDArray[np.int64] | None:
     if any(part.stamps is None for part in parts if part.members.size):
         return None
-    if len(parts) == 1 and parts[0].stamps is not None and parts[0].members.size == count:
-        return parts[0].stamps
     stamps = np.zeros(count, dtype=np.int64)
     for part in parts:
         if part.stamps is not None:

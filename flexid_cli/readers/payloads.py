@@ -11,6 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 
 _WORD = 8
 _TILE = 1 << 16  # bytes
+_WORTH_GATHERING = 1 << 10  # bytes of a payload that is copied as a whole rather than number by number
 _UNSIGNED = {8: "<u8", 4: "<u4", 2: "<u2", 1: "u1"}
 
 
@@ -23,13 +24,16 @@ class Payloads:
         Where they lie.
     starts : ndarray of int64, shape (n,), n > 0
         First byte of each.
+    stride : int, optional
+        Bytes from one to the next where they are known to lie evenly; 0: not known.
     """
 
-    def __init__(self, buffer: NDArray[np.uint8], starts: NDArray[np.int64]) -> None:
+    def __init__(self, buffer: NDArray[np.uint8], starts: NDArray[np.int64], stride: int = 0) -> None:
         self._buffer = buffer
         self._starts = starts
         self.count = starts.size
-        self._stride = _even_stride(starts)
+        self._stride = stride or _even_stride(starts)
+        self._first = int(starts[0])
 
     def column(self, offset: int, dtype: DTypeLike, width: int = 1) -> NDArray[Any]:
         """Return the numbers that stand ``offset`` bytes into each payload.
@@ -40,16 +44,25 @@ class Payloads:
             A view into the buffer where the payloads lie evenly, else a copy.
         """
         kind = np.dtype(dtype)
+        if self._stride and width == 1:
+            return np.ndarray((self.count,), kind, self._buffer, self._first + offset, (self._stride,))
         shape: tuple[int, ...] = (self.count,) if width == 1 else (self.count, width)
         if self._stride:
-            first = int(self._starts[0]) + offset
-            return np.ndarray(shape, kind, self._buffer, first, (self._stride, kind.itemsize)[: len(shape)])
+            first = self._first + offset
+            return np.ndarray(shape, kind, self._buffer, first, (self._stride, kind.itemsize))
         size = kind.itemsize * width
         # every byte of the buffer begins an item of this view, so that one indexing copies whole items
         items: NDArray[np.void] = np.ndarray(
             (self._buffer.size - size + 1,), f"V{size}", self._buffer, 0, (1,)
         )
         return items[self._starts + offset].view(kind).reshape(shape)
+
+    def gathered(self, length: int) -> Payloads:
+        """Return the same payloads, of ``length`` bytes each, lying evenly; copied where they do not."""
+        if self._stride or not 0 < length <= _WORTH_GATHERING:
+            return self
+        rows = self.column(0, f"V{length}")
+        return Payloads(rows.view(np.uint8), np.arange(0, self.count * length, length), length)
 
     def all_have(self, offset: int, tile: bytes, count: int) -> bool:
         """Whether the same bytes stand ``offset`` bytes into each payload.

@@ -21,7 +21,7 @@ from flexid_cli.readers.byte_source import ByteSource
 from flexid_cli.readers.container import Container, MessageReader, Probe
 from flexid_cli.readers.damage import explain
 from flexid_cli.readers.decoders import TopicType
-from flexid_cli.readers.loss import Loss
+from flexid_cli.readers.loss import Loss, TimeGaps
 from flexid_cli.readers.memory import keep_freed_memory
 from flexid_cli.readers.rosbag1_records import (
     CODECS,
@@ -32,6 +32,7 @@ from flexid_cli.readers.rosbag1_records import (
     Messages,
     Walk,
     entries,
+    holes,
     split,
 )
 
@@ -184,9 +185,11 @@ class BagFile:
         self._begin()
         keep_freed_memory()
         chunks = [chunk for chunk in self._walk.chunks if self._matters(chunk, wanted, window)]
+        gaps = TimeGaps(self.loss)
         for unpacked in self._unpacked(chunks):
             messages = self._split(unpacked)
             self._account(unpacked, messages)
+            gaps.take(*_around_holes(unpacked, messages))
             yield from self._batches(unpacked, messages, wanted, window)
             self._progress.advance(unpacked.chunk.end - unpacked.chunk.position)
 
@@ -292,6 +295,22 @@ class BagFile:
         if codec == "bz2":
             return _bz2(chunk, packed, limit)
         return _lz4(chunk, packed, min(limit, _MOST_LZ4 * len(packed)))
+
+
+def _around_holes(unpacked: _Unpacked, messages: Messages) -> tuple[NDArray[np.int64], list[int]]:
+    """Return the times of the messages that can be trusted, and before which of them some are missing."""
+    sure = np.ones_like(messages.sure) if unpacked.checked else messages.sure
+    if not unpacked.sound:
+        return messages.time[:0], [0]
+    is_whole = messages.indexed or not (unpacked.fault or messages.lost or unpacked.chunk.index)
+    if is_whole and unpacked.chunk.codec and sure.all():
+        return messages.time, []
+    places = [] if messages.indexed else holes(messages, len(unpacked.content), is_cut=bool(unpacked.fault))
+    missing = np.zeros(sure.size + 1, dtype=np.bool_)
+    missing[places] = True
+    missing[1:] |= ~sure
+    before = np.concatenate(([0], np.cumsum(sure)))
+    return messages.time[sure], np.unique(before[missing]).tolist()
 
 
 def _bz2(chunk: Chunk, packed: bytes, limit: int) -> _Unpacked:

@@ -217,11 +217,16 @@ class Walk:
         record = self._record(position)
         if record is None:
             return self._skip(position)
-        if record.end > size and record.op != CHUNK:
-            self.reasons.append((f"it is cut short in the record at byte {position}", size - position))
-            return size
         if record.op == CHUNK:
             return self._chunk(record)
+        if self._misses_the_next(record):
+            following = self._next(record.data)
+            if following is not None and following < record.end:
+                self.reasons.append((f"the length of the record at byte {position} is wrong", 0))
+                return following
+        if record.end > size:
+            self.reasons.append((f"it is cut short in the record at byte {position}", size - position))
+            return size
         if record.op == INDEX:
             self._index(record)
         elif record.op == CONNECTION:
@@ -233,6 +238,14 @@ class Walk:
         elif record.op == MESSAGE:
             return self._skip(position)
         return record.end
+
+    def _misses_the_next(self, record: Record) -> bool:
+        """Whether a record does not end where another one begins, so that its length may lead over others."""
+        if record.op == INDEX and record.end - record.data != record.number(b"count") * _TIMES.itemsize:
+            return True
+        return record.end > self._source.size or (
+            record.end < self._source.size and self._record(record.end) is None
+        )
 
     def _record(self, position: int) -> Record | None:
         for count in (_HEAD, _LONGEST_HEADER):
@@ -338,6 +351,31 @@ def split(content: bytes, index: Mapping[int, bytes], connections: dict[int, Con
     """
     found = _by_index(content, index, connections) if index else None
     return _by_walk(content, connections) if found is None else found
+
+
+def holes(messages: Messages, size: int, *, is_cut: bool) -> list[int]:
+    """Return the numbers of the messages of a damaged chunk that do not follow the one before them directly.
+
+    Parameters
+    ----------
+    messages : Messages
+        Of the chunk.
+    size : int
+        Its bytes when unpacked.
+    is_cut : bool
+        Whether it may not end there.
+
+    Returns
+    -------
+    list of int
+        0 where something stands before the first one; the number of messages where after the last.
+    """
+    if not messages.starts.size:
+        return [0]
+    ends = messages.starts + messages.lengths
+    heads = messages.starts - np.concatenate(([0], ends[:-1]))
+    places = np.flatnonzero(heads != heads.min()).tolist()
+    return [*places, heads.size] if is_cut or int(ends[-1]) != size else places
 
 
 def entries(index: bytes) -> tuple[Ints, Ints]:

@@ -31,11 +31,16 @@ _NEGATIVE_ZERO = re.compile(rb"-0+(?![0-9.])")
 
 
 class BadLine(NamedTuple):
-    """A line that gives no sample: its place in the block from 0, what is wrong, and how to cure it."""
+    """A line that gives no sample.
+
+    Its place in the block from 0, what is wrong, how to cure it, and how many rows it is for sure: 1 where it
+    has all its fields; a line with others may be two rows, or a part of one, and is None.
+    """
 
     place: int
     words: str
     hint: str
+    rows: int | None = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,8 @@ class Rows:
         Lines that gave no sample.
     holes : int
         Zero bytes in the bad lines: as many bytes were lost.
+    gaps : sequence of (int, int or None)
+        Per bad line the samples of the block before it, and `BadLine.rows`.
     """
 
     columns: Mapping[int, NDArray[Any]]
@@ -61,6 +68,7 @@ class Rows:
     lines: int
     bad: Sequence[BadLine] = field(default_factory=tuple)
     holes: int = 0
+    gaps: Sequence[tuple[int, int | None]] = ()
 
 
 class RowReader:
@@ -366,7 +374,11 @@ def _read_any(text: bytes, dialect: Dialect, encoding: str, wanted: Sequence[int
     bad: list[BadLine] = []
     holes = 0
     for place, line in enumerate(lines):
-        if not line.strip() or line.lstrip().startswith(dialect.comments):
+        if not line.strip():
+            continue
+        if line.lstrip().startswith(dialect.comments):
+            if _was_a_row(line, dialect):
+                bad.append(BadLine(place, f"the comment was a row: {line.strip()[:60]!r}", _COMMENT_HINT))
             continue
         row = _split(line, dialect)
         if isinstance(row, list):
@@ -381,9 +393,31 @@ def _read_any(text: bytes, dialect: Dialect, encoding: str, wanted: Sequence[int
         good = np.array([place not in spoilt for place in places], dtype=np.bool_)
         columns = {column: values[good] for column, values in columns.items()}
         places = [place for place in places if place not in spoilt]
-    return Rows(columns, len(places), len(lines), sorted(bad), holes)
+    bad = _one_each(bad)
+    before = np.searchsorted(places, [one.place for one in bad]).tolist()
+    gaps = [(samples, one.rows) for samples, one in zip(before, bad, strict=True)]
+    return Rows(columns, len(places), len(lines), bad, holes, gaps)
 
 
+def _one_each(bad: Iterable[BadLine]) -> list[BadLine]:
+    """Leave one entry per line, in the order of the lines: a line with two texts for numbers is one line."""
+    first: dict[int, BadLine] = {}
+    for one in bad:
+        first.setdefault(one.place, one)
+    return [first[place] for place in sorted(first)]
+
+
+def _was_a_row(line: str, dialect: Dialect) -> bool:
+    """Whether a comment is a row but for its mark: one flipped bit makes 3 a # and 5 a %."""
+    text = line.strip()
+    mark = next(mark for mark in dialect.comments if text.startswith(mark))
+    row = _fields(f"3{text[len(mark) :]}", dialect.delimiter)
+    return len(row) == len(dialect.fields) and all(
+        is_number(cell, dialect.decimal) or is_missing(cell) for cell in row
+    )
+
+
+_COMMENT_HINT = "remove the mark where the row is right; rows that are missing on purpose leave a gap too"
 _WIDTH_HINT = "correct or remove the line; the file may be two recordings in one, or damaged"
 
 
@@ -428,7 +462,8 @@ def _column(
         if number is None:
             name = dialect.fields[column].name
             words = f"column {name!r} has the text {text[:40]!r}, not a number"
-            bad.append(BadLine(places[index], words, _text_hint(dialect.decimal)))
+            whole = 1 if len(dialect.fields) > 1 else None  # two rows of one field each may be one line
+            bad.append(BadLine(places[index], words, _text_hint(dialect.decimal), whole))
             number = float("nan")
         values[index] = number
     return values

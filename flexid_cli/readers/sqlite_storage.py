@@ -19,7 +19,7 @@ from flexid_cli.readers.batch import Batch
 from flexid_cli.readers.container import Probe
 from flexid_cli.readers.damage import damaged, unreadable
 from flexid_cli.readers.decoders import TopicType
-from flexid_cli.readers.loss import Loss
+from flexid_cli.readers.loss import Loss, TimeGaps
 from flexid_cli.readers.memory import keep_freed_memory
 from flexid_cli.readers.sqlite_pages import Columns, PageFile, Rows
 
@@ -271,7 +271,11 @@ class SqliteFile:
         self._begin()
         if not numbers:
             return
+        gaps = TimeGaps(self.loss)
+        last: int | None = None
         for block, rows in self._rows(window):
+            gaps.take(rows.time, [] if self._salvage is None else _jumps(rows.rowid, last))
+            last = int(rows.rowid[-1]) if rows.rowid.size else last
             inside = np.ones(rows.time.size, dtype=np.bool_) if window.is_open else window.holds(rows.time)
             for number in numbers:
                 chosen = inside & (rows.topic == number)
@@ -296,6 +300,7 @@ class SqliteFile:
         """Put the contents together that go on in other pages."""
         parts: list[bytes] = []
         whole: list[int] = []
+        gaps = TimeGaps(self.loss)
         columns = (rows.rowid, rows.starts, rows.lengths, rows.local)
         for place, (rowid, start, length, local) in enumerate(
             zip(*(column.tolist() for column in columns), strict=True)
@@ -306,9 +311,11 @@ class SqliteFile:
                 rest = self._pages.chain(following, length - local)
                 if rest is None:
                     self.loss.add(f"{self.path}: the content of row {rowid} is not whole", 1)
+                    gaps.take(rows.time[:0], [0])
                     continue
                 part += rest
             parts.append(part)
+            gaps.take(rows.time[place : place + 1])
             whole.append(place)
         if not parts:
             return None
@@ -429,6 +436,12 @@ class SqliteFile:
             for place, start in enumerate(batch.starts.tolist()):
                 data = batch.buffer[start : start + int(batch.lengths[place])].tobytes()
                 probe.add(kind, int(batch.log_time[place]), data)
+
+
+def _jumps(rowid: Ints, last: int | None) -> list[int]:
+    """Places at which row numbers do not go on from the one before; ``last`` came before the first."""
+    before = 0 if last is None else last
+    return np.flatnonzero(np.diff(rowid, prepend=before) != 1).tolist()
 
 
 def _superseded(table: Ints) -> NDArray[np.bool_]:

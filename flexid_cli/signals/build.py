@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexid_cli.errors import DataError, InputError, UsageError
-from flexid_cli.readers.base import DEFAULT_OPTIONS, RawChannel, RawLog, ReadOptions
+from flexid_cli.readers.base import DEFAULT_OPTIONS, Damage, RawChannel, RawLog, ReadOptions
 from flexid_cli.signals.convert import Converted, convert_position, convert_torque
 from flexid_cli.signals.recording import Array, Recording, Segment
 from flexid_cli.signals.resample import PASS_BAND, STOP_DB, Resampled, resample
@@ -121,10 +121,9 @@ def recording_from_raw(raw: RawLog, config: Config, time: RawChannel | None = No
     """
     sources = _sources(config)
     channels = {role: raw.channels[source] for role, source in sources.items()}
-    clock = _choose(channels, config, time)
-    _refuse_shifted_rows(raw, config)
+    clock = _choose(raw, channels, config, time)
     timelines = _clean(clock, _max_gap(config))
-    timelines = {role: _broken(timeline, channels[role], raw) for role, timeline in timelines.items()}
+    timelines = {role: broken(timeline, channels[role], raw) for role, timeline in timelines.items()}
     signals = _convert_all(channels, sources, timelines, clock.name, config)
     for signal in signals.values():
         _require_motion(signal)
@@ -180,16 +179,24 @@ def _read(paths: Sequence[Path], config: Config, options: ReadOptions) -> tuple[
     rate = None if time is None else time.rate_hz
     column = None if source is None or rate is not None else raw.channels.get(str(source))
     if raw.format == "csv":
-        raw = cut_table(raw, _row_times(raw, column, config, rate), options)
+        times = (
+            _column_stamps(column, config) if column is not None else _row_times(raw, rate or 1.0, options)
+        )
+        raw = cut_table(raw, times, options)
         column = None if column is None else raw.channels[str(source)]
     return raw, column
 
 
-def _row_times(raw: RawLog, column: RawChannel | None, config: Config, rate: float | None) -> _RowTimes:
-    if column is not None:
-        return _column_stamps(column, config)
+def _row_times(raw: RawLog, rate_hz: float, options: ReadOptions) -> _RowTimes:
+    """Times of the rows by a fixed rate; where the window ends before they are lost, that is no fault."""
     rows = max((channel.values.size for channel in raw.channels.values()), default=0)
-    return fixed_rate_stamps(rows, rate or 1.0), np.ones(rows, dtype=np.bool_)
+    known = next((lost.before for lost in raw.lost_rows if lost.count is None and lost.before), rows)
+    if known < rows and options.end_s is not None:
+        before = tuple(lost for lost in raw.lost_rows if lost.before < known)
+        stamps = _fixed_stamps(replace(raw, lost_rows=before), rows, rate_hz)
+        if options.end_s * NS <= stamps[known - 1]:
+            return stamps, np.arange(rows) < known
+    return _fixed_stamps(raw, rows, rate_hz), np.ones(rows, dtype=np.bool_)
 
 
 def cut_table(raw: RawLog, times: _RowTimes, options: ReadOptions) -> RawLog:
@@ -204,22 +211,55 @@ def cut_table(raw: RawLog, times: _RowTimes, options: ReadOptions) -> RawLog:
     options : ReadOptions
         Their window.
 
+    Returns
+    -------
+    RawLog
+        Its account of damage says at which times rows are missing.
+
     Raises
     ------
     InputError
         No row lies in it.
     """
     stamps, valid = times
-    if options.window(0).is_open or not valid.any():
+    if not valid.any():
         return raw
     first = int(stamps[np.argmax(valid)])
+    if options.window(0).is_open:
+        return _with_spans(raw, stamps, valid, first)
     inside = valid & options.window(first).holds(stamps)
     if not inside.any():
         raise InputError(
             f"{raw.paths[0]}: nothing was recorded in the window from --start to --end",
             f"its times go up to {(int(stamps[valid].max()) - first) / NS:.6g} s",
         )
-    return replace(raw, channels={name: _rows(channel, inside) for name, channel in raw.channels.items()})
+    before = np.concatenate(([0], np.cumsum(inside)))
+    cut = replace(
+        raw,
+        channels={name: _rows(channel, inside) for name, channel in raw.channels.items()},
+        lost_rows=tuple(replace(lost, before=int(before[lost.before])) for lost in raw.lost_rows),
+    )
+    return _with_spans(cut, stamps[inside], valid[inside], first)
+
+
+def _with_spans(raw: RawLog, stamps: IntArray, valid: BoolArray, first_ns: int) -> RawLog:
+    """Say between which times the rows are missing that were lost, and those that were kept but may be wrong."""
+    usable = np.flatnonzero(valid & ~_suspect_rows(raw, stamps.size))
+    spans: dict[Path, set[tuple[float, float]]] = {}
+    for lost in raw.lost_rows:
+        place = int(np.searchsorted(usable, lost.before))
+        if 0 < place < usable.size:
+            begin, end = stamps[usable[place - 1]], stamps[usable[place]]
+            spans.setdefault(lost.path, set()).add((float(begin - first_ns) / NS, float(end - first_ns) / NS))
+    damage = tuple(
+        replace(one, spans_s=tuple(sorted({*one.spans_s, *spans.get(one.path, ())}))) for one in raw.damage
+    )
+    return replace(raw, damage=damage)
+
+
+def _suspect_rows(raw: RawLog, rows: int) -> BoolArray:
+    marks = next((channel.suspect for channel in raw.channels.values() if channel.suspect is not None), None)
+    return np.zeros(rows, dtype=np.bool_) if marks is None else marks
 
 
 def _rows(channel: RawChannel, rows: BoolArray) -> RawChannel:
@@ -272,15 +312,16 @@ def time_unit_of(channel: RawChannel) -> str:
 # --- clock ------------------------------------------------------------
 
 
-def _choose(channels: Mapping[str, RawChannel], config: Config, time: RawChannel | None) -> _Clock:
+def _choose(
+    raw: RawLog, channels: Mapping[str, RawChannel], config: Config, time: RawChannel | None
+) -> _Clock:
     settings = config.signals.time
     if settings is not None and settings.rate_hz is not None:
         rate = settings.rate_hz
-        _require_equal_length(
-            channels, max(c.values.size for c in channels.values()), f"the rate of {rate:g} Hz"
-        )
-        stamps = {role: (fixed_rate_stamps(c.values.size, rate), None) for role, c in channels.items()}
-        return _Clock("fixed_rate", f"{rate:g} Hz, configured", stamps)
+        rows = max(channel.values.size for channel in channels.values())
+        _require_equal_length(channels, rows, f"the rate of {rate:g} Hz")
+        stamps = _fixed_stamps(raw, rows, rate)
+        return _Clock("fixed_rate", f"{rate:g} Hz, configured", dict.fromkeys(channels, (stamps, None)))
     if time is not None:
         _require_equal_length(channels, time.values.size, f"the time channel {time.source!r}")
         nanoseconds, valid = _column_stamps(time, config)
@@ -349,8 +390,20 @@ def _clean(clock: _Clock, max_gap_s: float | None) -> dict[str, Timeline]:
     return {role: timelines[number] for role, number in place.items()}
 
 
-def _broken(timeline: Timeline, channel: RawChannel, raw: RawLog) -> Timeline:
-    """Break a clock where samples were lost, however few: what damage took away is never interpolated."""
+def broken(timeline: Timeline, channel: RawChannel, raw: RawLog) -> Timeline:
+    """Break a clock where samples were lost, however few: what damage took away is never interpolated.
+
+    Parameters
+    ----------
+    timeline : Timeline
+        Clock of the channel.
+    channel : RawChannel
+        As it was read.
+    raw : RawLog
+        Its log.
+    """
+    if raw.lost_rows:
+        return timeline.broken_at([lost.before for lost in raw.lost_rows if lost.count != 0])
     log_time = channel.stamps.get("log_time")
     if log_time is None or raw.first_ns is None:
         return timeline
@@ -364,18 +417,41 @@ def _broken(timeline: Timeline, channel: RawChannel, raw: RawLog) -> Timeline:
     return timeline.broken_at(samples) if samples else timeline
 
 
-def _refuse_shifted_rows(raw: RawLog, config: Config) -> None:
-    """Without stamps, a sample that is missing inside the record would shift all that follow it."""
-    time = config.signals.time
-    if time is None or time.rate_hz is None:
-        return
-    for damage in raw.damage:
-        if damage.lost or damage.suspect:
-            raise InputError(
-                f"{damage.path}: samples are lost, so a fixed rate_hz cannot place those after them; "
-                + damage.sentence(),
-                "name a column or clock that holds the time in signals.time.source",
-            )
+def _fixed_stamps(raw: RawLog, rows: int, rate_hz: float) -> IntArray:
+    """Stamps by a fixed rate, shape (rows,), in ns; rows that are missing keep their time.
+
+    Raises
+    ------
+    InputError
+        Samples are missing inside the record, nobody knows how many: those that follow would have a wrong time.
+    """
+    stamps = fixed_rate_stamps(rows, rate_hz)
+    if raw.format != "csv":
+        for damage in raw.damage:
+            if damage.suspect or damage.lost != 0:
+                hint = "leave rate_hz out, so that the log's own stamps are used"
+                raise _misplaced(damage, hint)
+        return stamps
+    accounts = {damage.path: damage for damage in raw.damage}
+    missing = np.zeros(rows, dtype=np.int64)
+    for lost in raw.lost_rows:
+        if not 0 < lost.before < rows:
+            continue
+        if lost.count is None:
+            hint = "name a column of times in signals.time.source, or stop before the damage with --end"
+            raise _misplaced(accounts[lost.path], hint)
+        missing[lost.before] += lost.count
+    if not missing.any():
+        return stamps
+    return fixed_rate_stamps(rows + int(missing.sum()), rate_hz)[np.arange(rows) + np.cumsum(missing)]
+
+
+def _misplaced(damage: Damage, hint: str) -> InputError:
+    return InputError(
+        f"{damage.path} is damaged ({damage.cause()}): samples are missing, and a fixed rate_hz cannot tell when "
+        "those after them were recorded",
+        hint,
+    )
 
 
 # --- signals ------------------------------------------------------------

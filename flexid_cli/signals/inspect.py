@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flexid_cli.errors import InputError, UsageError
-from flexid_cli.readers.base import DEFAULT_OPTIONS, ChannelInfo, Damage, RawChannel, ReadOptions
-from flexid_cli.signals.build import cut_table, find_time_column, time_unit_of
+from flexid_cli.readers.base import DEFAULT_OPTIONS, ChannelInfo, Damage, RawChannel, RawLog, ReadOptions
+from flexid_cli.signals.build import broken, cut_table, find_time_column, time_unit_of
 from flexid_cli.signals.recording import ClockStatistics
 from flexid_cli.signals.timebase import (
     CLOCKS,
@@ -129,7 +129,7 @@ def inspect_log(
         duration_s=_duration(clocks.values()),
         time_column=column,
         time_unit=unit,
-        channels=tuple(_summary(info, raw.channels[info.source], clocks[info.source]) for info in infos),
+        channels=tuple(_summary(info, raw, clocks[info.source]) for info in infos),
         notes=tuple(note.message for note in raw.notes),
         damage=raw.damage,
     )
@@ -170,10 +170,11 @@ def _duration(clocks: Iterable[_Stamps | None]) -> float | None:
     return max((high - low) / NS for low, high in spans.values()) if spans else None
 
 
-def _summary(info: ChannelInfo, channel: RawChannel, clock: _Stamps | None) -> ChannelSummary:
+def _summary(info: ChannelInfo, raw: RawLog, clock: _Stamps | None) -> ChannelSummary:
+    channel = raw.channels[info.source]
     finite = channel.values[np.isfinite(channel.values)]
     running = tuple(name for name in CLOCKS if name in channel.stamps and is_usable(channel.stamps[name]))
-    track = _track(info.source, channel, clock)
+    track = _track(info.source, raw, clock)
     return ChannelSummary(
         info=replace(info, count=int(channel.values.size), unit=channel.unit or info.unit),
         minimum=float(finite.min()) if finite.size else None,
@@ -185,11 +186,13 @@ def _summary(info: ChannelInfo, channel: RawChannel, clock: _Stamps | None) -> C
     )
 
 
-def _track(source: str, channel: RawChannel, clock: _Stamps | None) -> Track | None:
+def _track(source: str, raw: RawLog, clock: _Stamps | None) -> Track | None:
     if clock is None:
         return None
+    channel = raw.channels[source]
     try:
-        return make_track(source, source, clock[0], build_timelines([clock])[0], channel.values)
+        timeline = broken(build_timelines([clock])[0], channel, raw)
+        return make_track(source, source, clock[0], timeline, channel.values)
     except InputError:  # too few samples, or a clock that never stops jumping: nothing to say about it
         return None
 

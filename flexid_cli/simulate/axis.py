@@ -1,6 +1,8 @@
-"""Closed-loop simulation of one flexible axis: two masses, a spring, a sampled position controller.
+"""The simulation that the sample logs are made with, and the names of the machine's parts.
 
-The equations are the paper's (5) to (7), joint side, with sgn v taken as tanh(v / v0):
+The sample logs' bytes follow from this integrator (fourth-order Runge-Kutta, fixed steps); `engine` is the one for
+everything else: effects, set-valued friction, sensors, other inputs. The equations are the paper's (5) to (7),
+joint side, with sgn v taken as tanh(v / v0):
 
     Gm = Jm qm'' + FVm qm' + FSm sgn qm' + K (qm - q)
     0  = JL q'' + FV q' + FS sgn q' + MX g cos q + MY g sin q - K (qm - q)
@@ -8,83 +10,13 @@ The equations are the paper's (5) to (7), joint side, with sgn v taken as tanh(v
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from flexid_cli.errors import UsageError
+from flexid_cli.simulate.machine import Array, Axis, Controller, Record, Sensors, Trajectory
 
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Axis:
-    """Parameters of a flexible axis, joint side, SI.
-
-    The defaults are Table 1 of Pham, Gautier and Poignet (ICRA 2001).
-    """
-
-    Jm: float = 174.7996
-    K: float = 20341.0458
-    JL: float = 47.4458
-    FVm: float = 235.91
-    FSm: float = 41.4254
-    FV: float = 83.1508
-    FS: float = 8.4612
-    MX: float = -0.7241
-    MY: float = -53.4201
-    gravity: float = 9.81
-    torque_offset: float = 0.0
-    reversal_velocity: float = 1e-3
-
-    @property
-    def resonance_hz(self) -> float:
-        """Free-free resonance, sqrt(K (1/Jm + 1/JL)) / 2 pi."""
-        return float(np.sqrt(self.K * (1.0 / self.Jm + 1.0 / self.JL)) / (2.0 * np.pi))
-
-    @property
-    def antiresonance_hz(self) -> float:
-        """Locked-motor resonance, sqrt(K / JL) / 2 pi."""
-        return float(np.sqrt(self.K / self.JL) / (2.0 * np.pi))
-
-
-@dataclass(frozen=True)
-class Controller:
-    """P position and PI velocity loop, sampled and held.
-
-    u = kv e + ki integral(e dt), e = kp (ref - qm) + velocity_feedforward ref' - qm'; qm' by backward
-    difference of the measured position.
-    """
-
-    kp: float
-    kv: float
-    ki: float
-    velocity_feedforward: float = 1.0
-
-
-@dataclass(frozen=True)
-class Sensors:
-    """Resolution of the encoders (joint-side rad per count; 0: ideal) and torque noise (N m, one sigma)."""
-
-    motor_resolution: float = 0.0
-    joint_resolution: float = 0.0
-    torque_noise: float = 0.0
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """What was simulated, one row a control period; joint side, SI.
-
-    ``torque`` is recorded at the instant from which the controller holds it.
-    """
-
-    time_s: Array
-    torque: Array
-    motor_position: Array
-    joint_position: Array
-    reference_position: Array
+__all__ = ["Axis", "Controller", "Record", "Sensors", "Trajectory", "chirp", "simulate"]
 
 
 def simulate(
@@ -96,7 +28,7 @@ def simulate(
     sensors: Sensors | None = None,
     seed: int = 0,
     substeps: int = 20,
-) -> Trajectory:
+) -> Record:
     """Simulate the axis following ``reference``.
 
     Parameters
@@ -114,17 +46,30 @@ def simulate(
 
     Returns
     -------
-    Trajectory
+    Record
 
     Raises
     ------
     UsageError
-        The closed loop is unstable.
+        The closed loop is unstable, or something is asked for that only `engine` simulates.
     """
     sensors = sensors or Sensors()
     noise = np.random.default_rng(seed).normal(0.0, 1.0, reference.size) * sensors.torque_noise
-    parameters = np.array(list(asdict(axis).values()), dtype=np.float64)
-    gains = np.array(list(asdict(controller).values()), dtype=np.float64)
+    plain = Sensors(sensors.motor_resolution, sensors.joint_resolution, sensors.torque_noise)
+    if (
+        controller.period_s
+        or axis.load_reversal_velocity
+        or axis.reversal_velocity == 0.0
+        or sensors != plain
+    ):
+        raise UsageError("this integrator knows only the plain axis", "use simulate_closed_loop")
+    parameters = np.array(
+        [
+            axis.Jm, axis.K, axis.JL, axis.FVm, axis.FSm, axis.FV, axis.FS, axis.MX, axis.MY, axis.gravity,
+            axis.torque_offset, axis.reversal_velocity,
+        ]
+    )  # fmt: skip
+    gains = np.array([controller.kp, controller.kv, controller.ki, controller.velocity_feedforward])
     rest = np.array([float(reference[0]), _rest_position(axis, float(reference[0])), 0.0, 0.0])
     torque, motor, joint = _closed_loop(
         parameters,
@@ -141,7 +86,7 @@ def simulate(
             "the simulated loop is unstable", "lower the controller's gains or raise the sampling rate"
         )
     time = np.arange(reference.size) / sample_rate_hz
-    return Trajectory(time, torque + noise, motor, joint, np.asarray(reference, dtype=np.float64))
+    return Record(time, torque + noise, motor, joint, np.asarray(reference, dtype=np.float64))
 
 
 def chirp(start_hz: float, stop_hz: float, duration_s: float, sample_rate_hz: float) -> Array:

@@ -675,12 +675,14 @@ def test_cuts(codec: str, path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("little_memory")
 @pytest.mark.parametrize("codec", CODECS)
 def test_many_flips(codec: str, path: Path) -> None:
     check_flips(sample(codec, 4_000, 16_000), path, 2_000, 3)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("little_memory")
 @pytest.mark.parametrize("codec", CODECS)
 def test_many_cuts(codec: str, path: Path) -> None:
     check_cuts(sample(codec, 4_000, 16_000), path, 500, 4)

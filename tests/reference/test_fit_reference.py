@@ -321,6 +321,7 @@ def overdetermination(seed: int, phi: float = 0.0, extra: Array | None = None) -
         result=result,
         columns=SimpleNamespace(lengths=(ROWS,)),
         method="structured",
+        instruments=None,
     )
     config = SimpleNamespace(estimate=SimpleNamespace(covariance="hac"))
     free, test = regression(

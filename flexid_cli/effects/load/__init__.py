@@ -1,0 +1,1 @@
+"""Effects at the load: its weight, its friction, its own flexibility."""

@@ -1,0 +1,57 @@
+"""The load itself bends.
+
+What it is
+    A part of the load (arm, tool, payload) hangs on a spring of its own: a second resonance above the first.
+    JL is what is left of the inertia without that part.
+
+In the data
+    The load equation's residual is a peak in frequency, at the second mode, whatever the amplitude. Below it
+    the part moves along and looks like inertia.
+
+How to confirm
+    Strike the arm and listen, or put an accelerometer at its end. Another payload or posture moves the peak,
+    another amplitude does not.
+
+What to do
+    Keep the controller's bandwidth and the excitation below the peak, or use a notch filter; for simulation
+    take the three-mass model. A peak that falls over time points at a loose or cracked part.
+
+Literature
+    E. Wernholt, S. Gunnarsson, "Nonlinear identification of a physically parameterized robot model", IFAC
+    SYSID, 2006 (three masses).
+"""
+
+from __future__ import annotations
+
+from flexid_cli.effects import slots
+from flexid_cli.effects.base import Array, Effect, EffectParameter, EffectState, Law, Stage
+
+
+def _torque(w: Array, p: Array, x: Array, dx: Array, _g: Array) -> None:
+    if p[0] > 0.0:
+        torque = p[1] * (x[0] - w[slots.JOINT_POSITION]) + p[2] * (x[1] - w[slots.JOINT_VELOCITY])
+        w[slots.LOAD_TORQUE] -= torque
+        dx[0] = x[1]
+        dx[1] = -torque / p[0]
+    else:
+        dx[0] = 0.0
+        dx[1] = 0.0
+
+
+EFFECT = Effect(
+    code="FX303",
+    name="second_mode",
+    family="load",
+    equation="load",
+    term="-K2 (q2 - q) - D2 (q2' - q') with J2 q2'' = -K2 (q2 - q) - D2 (q2' - q')",
+    parameters=(
+        EffectParameter("second_inertia", "J2", "inertia", 0.0, 1e9, 8.0, 0.0),
+        EffectParameter("second_stiffness", "K2", "stiffness", 0.0, 1e15, 40000.0),
+        EffectParameter("second_damping", "D2", "viscous", 0.0, 1e12, 20.0),
+    ),
+    needs=("torque", "motor_position"),
+    best_recording="A multisine or chirp that reaches beyond the second resonance, sampled fast.",
+    text=__doc__,
+    laws=(Law(Stage.LOAD, _torque),),
+    states=(EffectState("position", "joint_position"), EffectState("velocity", "joint_velocity")),
+)

@@ -1,0 +1,50 @@
+"""Friction at the load that falls as the motion starts (Stribeck).
+
+What it is
+    Like friction at the motor, but behind the spring: bearings, seals and guides of the load rub harder at
+    rest and at very low speed than in motion.
+
+In the data
+    The load equation's residual differs from zero only where the load moves slowly, with the sign of its
+    velocity. The motor may already move while the load still sticks; then the torsion shows a saw tooth.
+
+How to confirm
+    Slow sweeps with both encoders: the torsion is largest just before the load starts. Without the joint
+    encoder it can be told from friction at the motor only near the resonance.
+
+What to do
+    Lubricate or replace the load's bearings and guides. For control, compensate the friction and filter the
+    reference.
+
+Literature
+    B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, Automatica 30(7), 1994.
+"""
+
+from __future__ import annotations
+
+import math
+
+from flexid_cli.effects import slots
+from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+
+
+def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
+    ratio = w[slots.JOINT_VELOCITY] / p[1]
+    w[slots.LOAD_COULOMB] += p[0] * math.exp(-ratio * ratio)
+
+
+EFFECT = Effect(
+    code="FX302",
+    name="stribeck_load",
+    family="load",
+    equation="load",
+    term="FStl exp(-(q'/vsl)^2) sgn(q')",
+    parameters=(
+        EffectParameter("stribeck_torque", "FStl", "torque", 0.0, 1e12, 10.0, 0.0),
+        EffectParameter("stribeck_velocity", "vsl", "velocity", 1e-9, 1e6, 0.03),
+    ),
+    needs=("torque", "motor_position"),
+    best_recording="Slow sweeps with many reversals, with both encoders.",
+    text=__doc__,
+    laws=(Law(Stage.LOAD, _torque),),
+)

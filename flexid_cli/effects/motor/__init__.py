@@ -1,0 +1,1 @@
+"""Effects at the motor: its torque, its friction, its magnets."""

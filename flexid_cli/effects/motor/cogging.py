@@ -1,0 +1,54 @@
+"""A torque that repeats with the motor's angle.
+
+What it is
+    Magnets prefer certain positions against the stator's teeth (cogging), and currents that are not
+    sinusoidal to the magnets' field add a ripple. Both repeat a whole number of times per motor revolution.
+
+In the data
+    The motor equation's residual is a line in the spectrum over the motor's angle, at the same cycles per
+    revolution at every speed. In the time domain its frequency moves with the speed.
+
+How to confirm
+    Turn slowly at constant speed in both directions: the torque repeats at the same angles, with the same
+    sign. Counts per revolution that are multiples of pole pairs or slots name the cause.
+
+What to do
+    Add a table of torque over the motor's angle to the feed-forward (drives often have one), or change to a
+    motor with skewed slots. A ripple that grows with the current comes from commutation: calibrate the
+    encoder's phase.
+
+Literature
+    P. Krause, O. Wasynczuk, S. Sudhoff, S. Pekarek, "Analysis of electric machinery and drive systems",
+    Wiley. B. Grcar, P. Cafuta, G. Stumberger, A. M. Stankovic, "Control-based reduction of pulsating torque
+    for PMAC machines", IEEE Trans. Energy Conversion 17(2), 2002.
+"""
+
+from __future__ import annotations
+
+import math
+
+from flexid_cli.effects import slots
+from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+
+
+def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
+    w[slots.MOTOR_TORQUE] += p[0] * math.sin(p[1] * w[slots.MOTOR_POSITION] + p[2])
+
+
+EFFECT = Effect(
+    code="FX106",
+    name="cogging",
+    family="motor",
+    equation="motor",
+    term="A sin(n qm + phi)",
+    parameters=(
+        EffectParameter("cogging_torque", "A", "torque", 0.0, 1e12, 12.0, 0.0),
+        EffectParameter("cogging_cycles", "n", "cycles", 1e-6, 1e7, 300.0),
+        EffectParameter("cogging_phase", "phi", "phase", -6.3, 6.3, 0.7),
+    ),
+    needs=("torque", "motor_position"),
+    best_recording="Slow motion at constant speed over several motor revolutions in both directions.",
+    text=__doc__,
+    laws=(Law(Stage.MOTOR, _torque),),
+    energy="conserves",
+)

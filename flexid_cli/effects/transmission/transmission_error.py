@@ -1,0 +1,56 @@
+"""The gear's ratio is not constant within a turn.
+
+What it is
+    Teeth and the wave generator are not perfect: the load's position differs from the motor's by a wave that
+    repeats with the motor's angle. d = qm + A sin(n qm + phi) - q.
+
+In the data
+    The difference of the encoders repeats at the same motor angles, at every speed, also without torque. Near
+    the resonance it drives the spring: motor and load equation have the same residual with opposite signs.
+
+How to confirm
+    Move slowly over several motor revolutions without load: the difference of the encoders is the wave. Two
+    cycles per turn of the wave generator are usual for strain wave gears. One cycle per turn of the joint
+    encoder is that encoder's eccentricity instead.
+
+What to do
+    Correct with a table over the motor's angle. A wave that grows points at a wrongly mounted or worn gear.
+
+Literature
+    F. H. Ghorbel, P. S. Gandhi, F. Alpeter, "On the kinematic error in harmonic drive gears", ASME J.
+    Mechanical Design 123(1), 2001.
+"""
+
+from __future__ import annotations
+
+import math
+
+from flexid_cli.effects import slots
+from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+
+
+def _kinematics(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
+    angle = p[1] * w[slots.MOTOR_POSITION] + p[2]
+    ratio = p[0] * p[1] * math.cos(angle)
+    w[slots.TORSION] += p[0] * math.sin(angle)
+    w[slots.TORSION_RATE] += ratio * w[slots.MOTOR_VELOCITY]
+    w[slots.GEAR] += ratio  # power conserving: the motor feels T times the derivative of d
+
+
+EFFECT = Effect(
+    code="FX205",
+    name="transmission_error",
+    family="transmission",
+    equation="transmission",
+    term="d = qm + A sin(n qm + phi) - q; the motor feels T (1 + A n cos(n qm + phi))",
+    parameters=(
+        EffectParameter("error_amplitude", "A", "position", 0.0, 1.0, 3e-4, 0.0),
+        EffectParameter("error_cycles", "n", "cycles", 1e-6, 1e7, 100.0),
+        EffectParameter("error_phase", "phi", "phase", -6.3, 6.3, 0.4),
+    ),
+    needs=("torque", "motor_position"),
+    best_recording="Slow motion at constant speed over several motor revolutions in both directions, both encoders.",
+    text=__doc__,
+    laws=(Law(Stage.KINEMATICS, _kinematics),),
+    energy="conserves",
+)
