@@ -259,8 +259,12 @@ class Pipeline(Model):
 class EstimateOptions(Model):
     """How parameters and their intervals are estimated."""
 
-    method: Literal["auto", "ols", "wls", "structured"] = Field(
-        default="auto", description="Least squares: ordinary, weighted by equation, or structured nonlinear."
+    method: Literal["auto", "ols", "wls", "irls", "iv", "structured", "minimum_distance", "output_error"] = (
+        Field(
+            default="auto",
+            description="Least squares: ordinary, weighted by equation, robust (Huber), structured nonlinear;"
+            " instrumental variables; minimum distance from the free coefficients; output error on a simulation.",
+        )
     )
     route: Literal["direct", "paper"] = Field(
         default="direct", description="direct: physical parameters are fitted; paper: Table 3's inversion."
@@ -284,6 +288,105 @@ class CsvOptions(Model):
     skip_rows: int | None = Field(default=None, ge=0, description="Rows to skip before the header.")
 
 
+class SimulatedParameters(Model):
+    """The simulated axis by the paper's symbols, joint side, SI (linear: m, N, kg)."""
+
+    Jm: Positive | None = Field(default=None, description="Motor inertia.")
+    K: Positive | None = Field(default=None, description="Joint stiffness.")
+    JL: Positive | None = Field(default=None, description="Load inertia.")
+    FVm: NotNegative | None = Field(default=None, description="Viscous friction of the motor.")
+    FSm: NotNegative | None = Field(default=None, description="Coulomb friction of the motor.")
+    FV: NotNegative | None = Field(default=None, description="Viscous friction of the load.")
+    FS: NotNegative | None = Field(default=None, description="Coulomb friction of the load.")
+    MX: Number | None = Field(default=None, description="First moment along x: gravity MX g cos q.")
+    MY: Number | None = Field(default=None, description="First moment along y: gravity MY g sin q.")
+    torque_offset: Number | None = Field(default=None, description="Constant torque on the motor.")
+    reversal_velocity: NotNegative | None = Field(
+        default=None,
+        description="Width v0 of the friction's sign, tanh(v/v0), joint side; 0: the axis sticks and breaks loose.",
+    )
+    load_reversal_velocity: NotNegative | None = Field(
+        default=None, description="The load's width where it differs from the motor's."
+    )
+
+
+class SimulatedSensors(Model):
+    """What measuring adds, joint side, SI; what is not given is ideal (an encoder in counts has its counts)."""
+
+    motor_counts_per_rev: Positive | None = Field(
+        default=None, description="Counts of the motor encoder per revolution of the motor."
+    )
+    joint_counts_per_rev: Positive | None = Field(
+        default=None, description="Counts of the joint encoder per revolution of the joint."
+    )
+    motor_resolution: NotNegative | None = Field(
+        default=None, description="In place of motor_counts_per_rev: one step in rad (m) at the joint side."
+    )
+    joint_resolution: NotNegative | None = Field(
+        default=None, description="In place of joint_counts_per_rev: one step in rad (m)."
+    )
+    torque_noise: NotNegative | None = Field(default=None, description="One sigma, N.m (N), joint side.")
+    motor_noise: NotNegative | None = Field(
+        default=None, description="One sigma, rad (m), joint side; the controller sees it too."
+    )
+    joint_noise: NotNegative | None = Field(default=None, description="One sigma, rad (m).")
+    torque_noise_time_s: NotNegative | None = Field(default=None, description="Correlation time; 0 is white.")
+    motor_noise_time_s: NotNegative | None = Field(default=None, description="Correlation time; 0 is white.")
+    joint_noise_time_s: NotNegative | None = Field(default=None, description="Correlation time; 0 is white.")
+    torque_delay_s: Number | None = Field(default=None, description="Age of the torque at its stamp.")
+    motor_delay_s: NotNegative | None = Field(
+        default=None, description="Age of the motor position at its stamp; the controller sees it late too."
+    )
+    joint_delay_s: Number | None = Field(default=None, description="Age of the joint position at its stamp.")
+    skew_s: Number | None = Field(
+        default=None,
+        description="How far the joint encoder's clock is behind the motor's (added to its delay).",
+    )
+    joint_zero: Number | None = Field(
+        default=None, description="Added to the joint position: the encoders' zeros differ."
+    )
+
+
+class SimulatedTrajectory(Model):
+    """What the reference does, joint side."""
+
+    kind: Literal["chirp", "updown", "multisine", "slow"] | None = Field(
+        default=None,
+        description="chirp: a sine of rising frequency; updown: there and back at many speeds; multisine: all"
+        " frequencies at once; slow: once there and back at constant speed.",
+    )
+    amplitude: Positive | None = Field(default=None, description="Largest distance from the start, rad (m).")
+    start_hz: Positive | None = Field(
+        default=None, description="Lowest frequency of chirp and multisine (and of updown's first way)."
+    )
+    stop_hz: Positive | None = Field(
+        default=None, description="Highest frequency of chirp and multisine (and of updown's last way)."
+    )
+    centre: Number | None = Field(default=None, description="Position around which it moves, rad (m).")
+
+
+class Simulation(Model):
+    """What `flexid simulate` simulates; options of the command line come first."""
+
+    parameters: SimulatedParameters = Field(
+        default=SimulatedParameters(), description="The axis; --report, --truth and --parameter replace it."
+    )
+    effects: dict[str, dict[str, Number]] = Field(
+        default={},
+        description="Effects by name with their parameters by name; see docs/simulation.md.",
+        examples=[{"backlash": {"gap": 0.001}}],
+    )
+    sensors: SimulatedSensors = Field(default=SimulatedSensors(), description="What measuring adds.")
+    trajectory: SimulatedTrajectory = Field(
+        default=SimulatedTrajectory(), description="What the reference does."
+    )
+    duration_s: Positive | None = Field(default=None, description="Length of the record; not given: 60 s.")
+    rate_hz: Positive | None = Field(
+        default=None, description="Rate of the record, and of the controller without a period_s."
+    )
+    seed: int | None = Field(default=None, ge=0, description="Seed of all noise; not given: 0.")
+
+
 class Config(Model):
     """Configuration of one axis and its log, version 1."""
 
@@ -299,6 +402,9 @@ class Config(Model):
     )
     estimate: EstimateOptions = EstimateOptions()
     csv: CsvOptions = CsvOptions()
+    simulation: Simulation | None = Field(
+        default=None, description="The machine that `flexid simulate` simulates; no other command reads it."
+    )
 
     @model_validator(mode="after")
     def _obey_rules(self) -> Config:
@@ -644,6 +750,22 @@ def _rule_csv(view: _View) -> Iterator[BrokenRule]:
             )
 
 
+def _rule_simulation(view: _View) -> Iterator[BrokenRule]:
+    for side in ("motor", "joint"):
+        counts, step = (
+            ("simulation", "sensors", f"{side}_{key}") for key in ("counts_per_rev", "resolution")
+        )
+        if view.get(*counts) is not None and view.get(*step) is not None:
+            yield BrokenRule(f"{counts[-1]} and {step[-1]} exclude each other", step, "keep one of the two")
+    start, stop = (view.get("simulation", "trajectory", key) for key in ("start_hz", "stop_hz"))
+    if isinstance(start, int | float) and isinstance(stop, int | float) and start >= stop:
+        yield BrokenRule(
+            "stop_hz does not lie above start_hz",
+            ("simulation", "trajectory", "stop_hz"),
+            "give the lower frequency as start_hz",
+        )
+
+
 _RULES: tuple[Callable[[_View], Iterator[BrokenRule]], ...] = (
     _rule_one_torque,
     _rule_known_units,
@@ -658,6 +780,7 @@ _RULES: tuple[Callable[[_View], Iterator[BrokenRule]], ...] = (
     _rule_controller,
     _rule_models,
     _rule_csv,
+    _rule_simulation,
 )
 
 

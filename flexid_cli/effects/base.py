@@ -30,6 +30,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from flexid_cli.effects.signature import Signature
 from flexid_cli.errors import UsageError
 
 Array = NDArray[np.float64]
@@ -133,6 +134,8 @@ class Effect:
     command : callable, optional
         ``command(torque, rate_hz, values)`` gives the command from the acting torque, where the effect stands
         between the two and the simulation is driven by the motor position.
+    signatures : tuple of Signature
+        What its forms look like in the equations, for the diagnosis.
     """
 
     code: str
@@ -149,6 +152,7 @@ class Effect:
     guards: int = 0
     energy: Literal["conserves", "dissipates", "exchanges"] = "dissipates"
     command: Callable[[Array, float, Mapping[str, float]], Array] | None = None
+    signatures: tuple[Signature, ...] = ()
 
     @property
     def examples(self) -> dict[str, float]:

@@ -178,7 +178,7 @@ def torque_hold(model: Model, result: FitResult, columns: Columns) -> Array:
                 gradient += coefficient * columns("torque", order + 2) * period**2 / 24.0
         gradients.append(gradient)
     column = np.concatenate([w * g for w, g in zip(result.weights, gradients, strict=True)])
-    return -_solve_normal(result, result.jacobian.T @ column)
+    return -_solve_normal(result, column)
 
 
 def gear_error(model: Model, result: FitResult, columns: Columns) -> Nuisance:
@@ -205,15 +205,17 @@ def left_out_flexibility(result: FitResult, columns: Columns) -> Nuisance:
 def reversal_width(
     model: Model, result: FitResult, columns: Columns, lengths: Sequence[int]
 ) -> Nuisance | None:
-    """Relative error of the reversal width v0, and what it would do to the parameters; None for a plain sign."""
+    """Error of ln v0, the reversal width, and what it would do to the parameters; None for a plain sign.
+
+    By the change of the columns over a factor of e: a narrow reversal is known to no better than that, and hardly
+    changes with less.
+    """
     width = columns.reversal_velocity
     if not width:
         return None
-    step = 0.2
     other = columns.like()
-    other.set_reversal_velocity(width * (1.0 + step))
-    gradients = [g / step for g in _sign_changes(model, result, columns, other)]
-    return _nuisance(result, gradients, lengths)
+    other.set_reversal_velocity(width * float(np.e))
+    return _nuisance(result, _sign_changes(model, result, columns, other), lengths)
 
 
 def sign_band(model: Model, result: FitResult, columns: Columns) -> Array:
@@ -225,7 +227,7 @@ def sign_band(model: Model, result: FitResult, columns: Columns) -> Array:
     other.set_reversal_velocity(columns.reversal_velocity)
     gradients = _sign_changes(model, result, columns, other)
     column = np.concatenate([w * g for w, g in zip(result.weights, gradients, strict=True)])
-    return -_solve_normal(result, result.jacobian.T @ column)
+    return -_solve_normal(result, column)
 
 
 def _sign_changes(model: Model, result: FitResult, columns: Columns, other: Columns) -> list[Array]:
@@ -244,9 +246,8 @@ def _nuisance(result: FitResult, gradients: Sequence[Array], lengths: Sequence[i
     """One step of the fit with a further parameter whose derivative of the residuals is given."""
     column = np.concatenate([w * g for w, g in zip(result.weights, gradients, strict=True)])
     residual = np.concatenate([w * e for w, e in zip(result.weights, result.residuals, strict=True)])
-    J = result.jacobian
-    projection = _solve_normal(result, J.T @ column)
-    free = column - J @ projection
+    projection = _solve_normal(result, column)
+    free = column - result.jacobian @ projection
     energy = float(free @ free)
     if energy <= 1e-12 * float(column @ column):
         return Nuisance(0.0, float("inf"), -projection)
@@ -256,10 +257,6 @@ def _nuisance(result: FitResult, gradients: Sequence[Array], lengths: Sequence[i
     return Nuisance(value, float(np.sqrt(covariance[0, 0])), -projection)
 
 
-def _solve_normal(result: FitResult, right: Array) -> Array:
-    """(J'J)^-1 right, by the column-scaled singular value decomposition."""
-    scale = np.linalg.norm(result.jacobian, axis=0)
-    scale[scale == 0.0] = 1.0
-    _, s, Vt = np.linalg.svd(result.jacobian / scale, full_matrices=False)
-    inverse = np.where(np.arange(s.size) < result.rank, 1.0 / np.maximum(s, 1e-300) ** 2, 0.0)
-    return np.asarray(Vt.T @ (inverse * (Vt @ (right / scale))) / scale, dtype=np.float64)
+def _solve_normal(result: FitResult, column: Array) -> Array:
+    """What the parameters take up of a column, shape (p,)."""
+    return np.asarray(result.bread @ (result.instruments.T @ column), dtype=np.float64)

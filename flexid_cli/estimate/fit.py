@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.errors import DataError
-from flexid_cli.estimate.covariance import robust_covariance
+from flexid_cli.estimate.covariance import combined_covariance
 from flexid_cli.estimate.least_squares import numerical_rank, triangle
 from flexid_cli.models.base import Block, Model
 
@@ -43,6 +43,10 @@ class FitResult:
         Weighted derivative of the stacked residuals, for sensitivities.
     weights : tuple of float
         Weights of the blocks.
+    bread : ndarray, shape (p, p)
+        Inverse of the normal matrix that the parameters were solved with.
+    instruments : ndarray, shape (blocks * r, p)
+        What the residuals are made orthogonal to: the Jacobian itself in least squares.
     """
 
     theta: Array
@@ -56,6 +60,8 @@ class FitResult:
     converged: bool
     jacobian: Array
     weights: tuple[float, ...]
+    bread: Array
+    instruments: Array
 
     @property
     def stderr(self) -> Array:
@@ -199,8 +205,7 @@ def _finish(
     bread = inverse / np.outer(scale, scale)
     weighted_residuals = [w * e for w, e in zip(weights, residuals, strict=True)]
     if covariance == "hac":
-        scores = sum(Jk * ek[:, None] for Jk, ek in zip(jacobians, weighted_residuals, strict=True))
-        robust = robust_covariance(np.asarray(scores), bread, lengths)
+        robust = combined_covariance(J, J, bread, np.concatenate(weighted_residuals), len(residuals), lengths)
         matrix, dof = robust.covariance, robust.degrees_of_freedom
     else:
         count = J.shape[0] - rank
@@ -218,4 +223,14 @@ def _finish(
         converged=converged,
         jacobian=J,
         weights=tuple(float(w) for w in weights),
+        bread=bread,
+        instruments=J,
     )
+
+
+def scaled_inverse(normal: Array) -> Array:
+    """Pseudo-inverse of a normal matrix after scaling it by its diagonal, shape (p, p)."""
+    scale = np.sqrt(np.abs(np.diag(normal)))
+    scale[scale == 0.0] = 1.0
+    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13)
+    return np.asarray(inverse / np.outer(scale, scale), dtype=np.float64)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.errors import DataError
-from flexid_cli.estimate import band, budget, paper_route, summary
+from flexid_cli.estimate import band, budget, methods, paper_route, summary
 from flexid_cli.estimate.fit import FitResult, block_matrices, block_matrix, fit
 from flexid_cli.estimate.least_squares import solve, triangle
 from flexid_cli.estimate.result import Identification, ModelResult, Skipped
-from flexid_cli.estimate.reversal import fit_reversal_velocity
+from flexid_cli.estimate.reversal import COARSE_GRID, FINE_GRID, fit_reversal_velocity
 from flexid_cli.estimate.solution import Solution
 from flexid_cli.models import motor_only
 from flexid_cli.models.motor_only import MotorOnly
@@ -133,7 +133,7 @@ def _two_encoders(recording: Recording, config: Config, f1: float | None) -> Sol
     columns.set_reversal_velocity(fit_reversal_velocity(columns, cost))
     method = config.estimate.method
     model: TwoEncoders | TwoEncodersStructured = TwoEncoders()
-    if method in {"auto", "structured"}:
+    if method not in {"ols", "wls"}:
         model = TwoEncodersStructured()
     matrices = block_matrices(model, columns)
     result = fit(
@@ -144,10 +144,8 @@ def _two_encoders(recording: Recording, config: Config, f1: float | None) -> Sol
         weighted=method != "ols",
         covariance=config.estimate.covariance,
     )
-    if method == "auto":
-        reason = "motor and torsion equation, weighted: what the load equation lacks cannot draw K to zero"
-        return Solution(model, columns, matrices, result, tuning, "structured", reason)
-    return Solution(model, columns, matrices, result, tuning, method, "configured")
+    plain = Solution(model, columns, matrices, result, tuning, method, "configured")
+    return methods.two_encoders(plain, config)
 
 
 def _two_encoders_start(columns: Columns) -> Array:
@@ -172,14 +170,18 @@ def _motor_only(recording: Recording, config: Config, f1: float | None) -> Solut
     model = MotorOnly(gravity_form(recording))
     start = _motor_start(columns, model)
 
+    # Instruments bring a width of their own, free of the noise that draws this one.
+    grid = COARSE_GRID if methods.uses_instruments(config) else FINE_GRID
+
     def cost() -> float:
         # The linear fit's free coefficients would hide a wrong width: only the physical ones feel it.
-        return float(np.log(_motor_fit(columns, model, start, "iid", rebuilds=2)[1].sigmas[0]))
+        return float(np.log(_motor_fit(columns, model, start, "iid", rebuilds=1)[1].sigmas[0]))
 
-    columns.set_reversal_velocity(fit_reversal_velocity(columns, cost))
+    columns.set_reversal_velocity(fit_reversal_velocity(columns, cost, grid=grid))
     matrices, result = _motor_fit(columns, model, start, config.estimate.covariance, rebuilds=MAX_REBUILDS)
     reason = "direct fit of the physical parameters to the exact equation (18), all terms kept"
-    return Solution(model, columns, matrices, result, tuning, "structured", reason)
+    plain = Solution(model, columns, matrices, result, tuning, "structured", reason)
+    return methods.motor_only(plain, config)
 
 
 def _motor_fit(

@@ -103,6 +103,49 @@ def solve(W: Array, Y: Array) -> LeastSquares:
     )
 
 
+def solve_instrumented(W: Array, Y: Array, Z: Array) -> LeastSquares:
+    """Instrumental variables, X = (Z'W)^-1 Z'Y, as many instruments as parameters.
+
+    Parameters
+    ----------
+    W : ndarray, shape (r, p)
+        Observation matrix.
+    Y : ndarray, shape (r,)
+        Measurement vector.
+    Z : ndarray, shape (r, p)
+        Instruments: correlated with W, not with the residual.
+
+    Returns
+    -------
+    LeastSquares
+        ``bread`` is (Z'W)^-1, ``covariance`` sigma^2 (Z'W)^-1 Z'Z (W'Z)^-1.
+
+    Raises
+    ------
+    DataError
+        As `solve`, on W.
+    """
+    plain = solve(W, Y)
+    left, right = np.linalg.norm(Z, axis=0), np.linalg.norm(W, axis=0)
+    left = np.where(left > 0.0, left, 1.0)
+    inverse = np.linalg.pinv((Z / left).T @ (W / right), rcond=1e-13) / np.outer(right, left)
+    # From the least squares solution, so that only the difference suffers from the squared condition.
+    estimate = plain.estimate + inverse @ (Z.T @ plain.residuals)
+    residuals = Y - W @ estimate
+    sigma = float(np.linalg.norm(residuals) / np.sqrt(W.shape[0] - W.shape[1]))
+    covariance = sigma**2 * inverse @ (Z.T @ Z) @ inverse.T
+    return LeastSquares(
+        estimate=estimate,
+        stderr=np.sqrt(np.diag(covariance)),
+        residuals=residuals,
+        sigma=sigma,
+        covariance=covariance,
+        bread=inverse,
+        condition_number=plain.condition_number,
+        rank=plain.rank,
+    )
+
+
 def triangle(W: Array) -> Array:
     """Triangular factor R of W = QR, shape (min(r, p), p)."""
     R = np.linalg.qr(W, mode="r")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,28 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Correction:
+    """Noise in the columns, taken out of the solution.
+
+    Attributes
+    ----------
+    shift : ndarray, shape (p,)
+        By how much the estimates moved from those of plain least squares.
+    doubt : ndarray, shape (p,)
+        Standard error that the doubt about the noise levels leaves.
+    share : float
+        Largest share of noise in what a direction of the parameters rests on.
+    moments : tuple of ndarray
+        Expected cross products of the noise, of each block.
+    """
+
+    shift: Array
+    doubt: Array
+    share: float
+    moments: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True)
 class Solution:
     """A model, its columns, and the fit.
 
@@ -25,6 +47,14 @@ class Solution:
         The blocks' columns, as `fit.block_matrices` gives them.
     method, method_reason : str
         Estimator, and why it was taken.
+    correction : Correction or None
+        None where the noise in the columns is left in.
+    instruments : tuple of ndarray or None
+        The blocks' instruments, shaped like ``matrices``; None in least squares.
+    outputs : FitResult or None
+        The output-error fit, where it is the one to report; ``result`` is then what it started from.
+    notes : tuple of str
+        What a person should know of the estimator: a fallback and its reason.
     """
 
     model: Model
@@ -34,3 +64,12 @@ class Solution:
     tuning: Tuning
     method: str
     method_reason: str
+    correction: Correction | None = None
+    instruments: tuple[Array, ...] | None = None
+    outputs: FitResult | None = None
+    notes: tuple[str, ...] = field(default_factory=tuple)
+
+    @property
+    def reported(self) -> FitResult:
+        """The fit whose parameters are reported."""
+        return self.outputs or self.result

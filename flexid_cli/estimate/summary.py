@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.errors import DataError
-from flexid_cli.estimate import budget, overdetermination
+from flexid_cli.estimate import budget, checks, overdetermination
 from flexid_cli.estimate.result import Estimate, Fit, ModelResult, PipelineSummary, Spectrum, Trace
 from flexid_cli.estimate.solution import Solution
 from flexid_cli.estimate.verdict import correlated_with, demoted, judge, model_doubt, undetermined
@@ -37,6 +38,8 @@ CLEAR_GEAR_SIGMA = 5.0
 # A ratio of tooth numbers is off by one tooth or not at all: by a thousandth for a ratio of a thousand.
 SMALLEST_GEAR_ERROR = 1e-3
 SPECTRUM_SEGMENT_S = 8.0
+# The restrictions' p value below which their violation widens the intervals.
+CONTRADICTED = 0.05
 # A uniform doubt between zero and the full shift has this standard deviation about zero.
 UNIFORM = 1.0 / np.sqrt(3.0)
 
@@ -57,6 +60,8 @@ class Uncertainty:
         Torque delay as the residuals show it.
     gear : budget.Nuisance or None
         Relative error of the gear ratio, where both encoders show one clearly.
+    shifts : mapping of str to ndarray, shape (p,)
+        Standard error that each systematic source adds.
     """
 
     covariance: Array
@@ -64,6 +69,7 @@ class Uncertainty:
     largest: tuple[str, ...]
     delay: budget.Nuisance
     gear: budget.Nuisance | None = None
+    shifts: Mapping[str, Array] = field(default_factory=dict)
 
 
 def summarise(solution: Solution, config: Config, *, regression: bool = True) -> ModelResult:
@@ -73,13 +79,17 @@ def summarise(solution: Solution, config: Config, *, regression: bool = True) ->
     misfit = 1.0
     if regression and solution.model.id == "motor_only":
         free, tests["over_determination"] = _free_regression(solution, config)
-        misfit = max(1.0, tests["over_determination"].get("scaled_statistic") or 1.0)
+        misfit = _misfit(tests["over_determination"])
     uncertainty = total_uncertainty(solution, config, misfit)
-    parameters, theta, covariance = _reported(solution.model, solution.result.theta, uncertainty.covariance)
+    parameters, theta, covariance = _reported(solution.model, solution.reported.theta, uncertainty.covariance)
     estimates = _estimates(solution, config, uncertainty, parameters, theta, covariance)
     fitted = _fit(solution)
     doubt = model_doubt(estimates, fitted.fit_percent)
     tests["torque_delay"] = _delay_test(uncertainty.delay, solution)
+    if regression:
+        tests |= checks.solution_tests(solution)
+        tests |= _profile(solution, config, uncertainty)
+        tests["bias_budget"] = _bias_budget(solution, uncertainty, parameters)
     effects = dict.fromkeys(p.effect for p in parameters if p.effect)
     return ModelResult(
         id=solution.model.id,
@@ -104,6 +114,14 @@ def summarise(solution: Solution, config: Config, *, regression: bool = True) ->
     )
 
 
+def _misfit(test: Mapping[str, Any]) -> float:
+    """How much larger than the residuals explain the contradiction of the free coefficients is, where it is sure."""
+    p_value = test.get("p_value")
+    if p_value is None or p_value > CONTRADICTED:
+        return 1.0
+    return max(1.0, float(test["scaled_statistic"]))
+
+
 def _free_regression(solution: Solution, config: Config) -> tuple[tuple[Estimate, ...], dict[str, Any]]:
     """X1..X7 without restrictions and the test of these, or why there are none."""
     try:
@@ -125,8 +143,15 @@ def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -
     delay = budget.torque_delay(model, result, columns, lengths)
     shifts: dict[str, Array] = {}
     if config.estimate.covariance == "hac":
-        levels = budget.limited_torque_noise(model, result, columns, budget.noise_levels(columns.recording))
-        shifts["encoder and torque noise in the columns"] = budget.noise_bias(model, result, columns, levels)
+        if solution.correction is not None:
+            shifts["doubt about the noise in the columns"] = solution.correction.doubt
+        else:
+            levels = budget.limited_torque_noise(
+                model, result, columns, budget.noise_levels(columns.recording)
+            )
+            shifts["encoder and torque noise in the columns"] = budget.noise_bias(
+                model, result, columns, levels
+            )
         torque = config.signals.torque
         if torque.hold != "instant":
             # Declared held, its damping has been applied; but no current controller makes exact steps.
@@ -144,17 +169,18 @@ def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -
     gear = _clear_gear_error(solution)
     if gear is not None:
         shifts["a doubt about the gear ratio"] = gear.shift(at_most=0.0)
-    random_part = misfit * result.covariance
+    # An output-error fit has its own random part; what systematic sources do to it is taken from its start.
+    random_part = misfit * solution.reported.covariance
     covariance = random_part + sum(np.outer(s, s) for s in shifts.values())
     random = np.maximum(np.diag(random_part), np.finfo(float).tiny)
     share = np.diag(covariance) / random
-    dof = np.minimum(result.degrees_of_freedom * share**2, 1e6)
+    dof = np.minimum(solution.reported.degrees_of_freedom * share**2, 1e6)
     largest = []
     for k in range(result.theta.size):
         sizes = {name: abs(float(shift[k])) for name, shift in shifts.items()}
         name = max(sizes, key=sizes.__getitem__, default="")
         largest.append(name if name and shifts[name][k] ** 2 > random[k] else "")
-    return Uncertainty(covariance, dof, tuple(largest), delay, gear)
+    return Uncertainty(covariance, dof, tuple(largest), delay, gear, shifts)
 
 
 def _clear_gear_error(solution: Solution) -> budget.Nuisance | None:
@@ -259,7 +285,7 @@ def _derived(solution: Solution, config: Config, uncertainty: Uncertainty) -> tu
     index = [symbols.index(s) for s in ("Jm", "K", "JL")]
     if set(index) & set(solution.result.dependent):
         return ()
-    Jm, K, JL = (float(x) for x in solution.result.theta[index])
+    Jm, K, JL = (float(x) for x in solution.reported.theta[index])
     covariance = uncertainty.covariance[np.ix_(index, index)]
     dof = float(np.min(uncertainty.degrees_of_freedom[index]))
     found = []
@@ -378,9 +404,44 @@ def _delay_test(delay: budget.Nuisance, solution: Solution) -> dict[str, Any]:
     }
 
 
+def _profile(solution: Solution, config: Config, uncertainty: Uncertainty) -> dict[str, dict[str, Any]]:
+    """Profile interval of the stiffness, for estimates that the estimating equations give directly."""
+    symbols = [p.symbol for p in solution.model.parameters]
+    if "K" not in symbols or solution.method in {"irls", "minimum_distance", "output_error"}:
+        return {}
+    k = symbols.index("K")
+    if k in solution.result.dependent or not uncertainty.covariance[k, k] > 0.0:
+        return {}
+    stderr = float(np.sqrt(uncertainty.covariance[k, k]))
+    return {"stiffness_profile": checks.stiffness_profile(solution, stderr, config.estimate.confidence_level)}
+
+
+def _bias_budget(
+    solution: Solution, uncertainty: Uncertainty, parameters: tuple[Parameter, ...]
+) -> dict[str, Any]:
+    """What was corrected, and what each systematic source may still add, in per cent of each parameter."""
+    theta = solution.reported.theta
+    budget_of: dict[str, Any] = {}
+    for k, parameter in enumerate(parameters):
+        if k in solution.result.dependent or parameter is TORSION_ZERO or theta[k] == 0.0:
+            continue
+        sources = {name: 100.0 * abs(float(s[k] / theta[k])) for name, s in uncertainty.shifts.items()}
+        entry: dict[str, Any] = {"random_percent": 100.0 * abs(solution.reported.stderr[k] / theta[k])}
+        if solution.correction is not None:
+            entry["corrected_percent"] = 100.0 * float(solution.correction.shift[k] / theta[k])
+        budget_of[parameter.symbol] = {**entry, "systematic_percent": sources}
+    share = None if solution.correction is None else solution.correction.share
+    return {
+        "noise_share": share,
+        "parameters": budget_of,
+        "meaning": "largest share of noise in what the parameters rest on; the JSON holds the budget by parameter",
+    }
+
+
 def _warnings(solution: Solution, uncertainty: Uncertainty, config: Config, doubt: str) -> tuple[str, ...]:
     model = solution.model.id
     warnings = [f"{model}: {doubt}; no parameter counts as identified"] if doubt else []
+    warnings += solution.notes
     # With physics missing the residuals' delay is a symptom, not a timing that could be set.
     if not doubt:
         warnings += _delay_warning(solution, uncertainty.delay, config)

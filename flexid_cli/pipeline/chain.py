@@ -154,8 +154,14 @@ class Chain:
                 f" {self.band_hz:.3g} Hz",
                 "record longer, or raise pipeline.band_hz",
             )
-        if self._lowpass is not None:
-            x = filters.zero_phase(x, self._lowpass)
+        return self.finish(self.smooth(x), derivative)
+
+    def smooth(self, x: Array) -> Array:
+        """The first step of `apply`, which all derivatives of a signal share: the low pass."""
+        return x if self._lowpass is None else filters.zero_phase(x, self._lowpass)
+
+    def finish(self, x: Array, derivative: int) -> Array:
+        """The other steps of `apply`, on what `smooth` gave: derivative, decimation, trim."""
         reach = self._reach
         column = derivatives.differentiate(
             x,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,19 +28,29 @@ def butterworth(order: int, cutoff_hz: float, sample_rate_hz: float) -> Array:
     UsageError
         The cutoff is not below half the sampling rate.
     """
-    from scipy.signal import butter
-
     if not 0.0 < cutoff_hz < 0.5 * sample_rate_hz:
         raise UsageError(
             f"low-pass cutoff {cutoff_hz:g} Hz is not between 0 and half the sampling rate"
             f" ({0.5 * sample_rate_hz:g} Hz)",
             "lower pipeline.lowpass.cutoff_hz or leave it out",
         )
+    return _butterworth(order, cutoff_hz, sample_rate_hz).copy()
+
+
+@lru_cache(maxsize=64)
+def _butterworth(order: int, cutoff_hz: float, sample_rate_hz: float) -> Array:
+    from scipy.signal import butter
+
     return np.asarray(butter(order, cutoff_hz, fs=sample_rate_hz, output="sos"), dtype=np.float64)
 
 
 def decimation_filter(factor: int) -> Array:
     """Second-order sections of the low pass before keeping one sample in ``factor`` (1: all-pass)."""
+    return _decimation_filter(factor).copy()
+
+
+@lru_cache(maxsize=64)
+def _decimation_filter(factor: int) -> Array:
     from scipy.signal import cheby1
 
     if factor == 1:
@@ -61,13 +73,34 @@ def zero_phase(x: Array, sos: Array, *, settled_edges: bool = True) -> Array:
         then it is the same linear operator for every column whatever its noise at the first sample, which is
         what parallel decimation needs.
     """
-    from scipy.signal import sosfilt, sosfiltfilt
+    from scipy.signal import sosfilt
 
     if settled_edges:
-        padding = min(settling_samples(sos), x.size - 1)
-        return np.asarray(sosfiltfilt(sos, x, padtype="odd", padlen=padding), dtype=np.float64)
+        return _settled_both_ways(x, sos)
     forward = sosfilt(sos, x)
     return np.asarray(sosfilt(sos, forward[::-1])[::-1], dtype=np.float64)
+
+
+def _settled_both_ways(x: Array, sos: Array) -> Array:
+    """Forward and backward over the odd extension, each pass from the rest state of its first value."""
+    from scipy.signal import sosfilt
+
+    padding = min(settling_samples(sos), x.size - 1)
+    before = 2.0 * x[0] - x[padding:0:-1]
+    after = 2.0 * x[-1] - x[-2 : -padding - 2 : -1]
+    extended = np.concatenate([before, x, after])
+    rest = _rest_state(sos.tobytes(), sos.shape[0])
+    forward, _ = sosfilt(sos, extended, zi=rest * extended[0])
+    backward, _ = sosfilt(sos, forward[::-1], zi=rest * forward[-1])
+    return np.ascontiguousarray(backward[::-1][padding : padding + x.size])
+
+
+@lru_cache(maxsize=64)
+def _rest_state(sections: bytes, count: int) -> Array:
+    """State of each section after a long constant input of one; solving for it costs as much as filtering."""
+    from scipy.signal import sosfilt_zi
+
+    return np.asarray(sosfilt_zi(np.frombuffer(sections).reshape(count, 6).copy()), dtype=np.float64)
 
 
 def magnitude(sos: Array, frequency_hz: Array, sample_rate_hz: float) -> Array:

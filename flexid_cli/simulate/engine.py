@@ -84,7 +84,10 @@ def simulate_closed_loop(
     at = np.arange(controls.max() + 1) * period
     grid = np.arange(reference.size) / rate_hz
     wanted = reference if controller.period_s is None else np.interp(at, grid, reference)
-    gains = np.array([controller.kp, controller.kv, controller.ki, controller.velocity_feedforward, period])
+    gains = np.array(
+        [controller.kp, controller.kv, controller.ki, controller.velocity_feedforward, period, 0.0]
+    )
+    gains[5] = 0.0 if initial is None else initial.integral
     plan = _Plan(times, controls, rows, np.empty((0, 6)), gains, wanted)
     start = initial or InitialState(float(reference[0]), _rest_position(axis, float(reference[0])))
     return _simulate(
@@ -218,7 +221,7 @@ def _rate(rate_hz: float) -> float:
 def _record_plan(inputs: Array, rate_hz: float) -> _Plan:
     n = inputs.shape[0]
     index = np.arange(n, dtype=np.int64)
-    return _Plan(index / _rate(rate_hz), np.full(n, -1), index, inputs, np.zeros(5), np.zeros(1))
+    return _Plan(index / _rate(rate_hz), np.full(n, -1), index, inputs, np.zeros(6), np.zeros(1))
 
 
 def _breakpoints(n: int, record_s: float, control_s: float) -> tuple[Array, Index, Index]:
@@ -325,7 +328,7 @@ def _simulate(
         random, plan.times.size, sensors.motor_noise, sensors.motor_noise_time_s, plan.times
     )
     joint_noise = coloured(random, n, sensors.joint_noise, sensors.joint_noise_time_s, np.arange(n) / rate_hz)
-    out = np.empty((n, kernel.COLUMNS + len(states)))
+    out = np.empty((kernel.COLUMNS + len(states), n))
     control = _control(axis, solver, driven)
     status, time = kernel.run(
         w, p, laws, stages, work, sizes, kinds, starts, int(rest),
@@ -333,7 +336,7 @@ def _simulate(
         np.array([sensors.motor_resolution, sensors.motor_delay_s]), motor_noise, control, out,
     )  # fmt: skip
     _check(status, time, control, solver, plan.inputs.shape[0] == 0, out)
-    torque = _commands(out[:, kernel.COMMAND], rate_hz, effects) if driven else out[:, kernel.COMMAND]
+    torque = _commands(out[kernel.COMMAND], rate_hz, effects) if driven else out[kernel.COMMAND]
     torque = _held_late(torque, sensors.torque_delay_s * rate_hz) + torque_noise
     joint = _joint_measured(out, rate_hz, sensors, joint_noise)
     return _trajectory(
@@ -391,10 +394,10 @@ def _held_late(torque: Array, delay_samples: float) -> Array:
 
 def _joint_measured(out: Array, rate_hz: float, sensors: Sensors, noise: Array) -> Array:
     """Joint position as it is recorded: late, off its zero, noisy, in counts."""
-    delay = (out[:, kernel.JOINT_DELAY] + sensors.joint_delay_s) * rate_hz
-    position = out[:, kernel.MEASURED_JOINT].copy()
+    delay = (out[kernel.JOINT_DELAY] + sensors.joint_delay_s) * rate_hz
+    position = out[kernel.MEASURED_JOINT].copy()
     if np.any(delay != 0.0):
-        position = _shifted(position, out[:, kernel.MEASURED_JOINT_RATE] / rate_hz, delay)
+        position = _shifted(position, out[kernel.MEASURED_JOINT_RATE] / rate_hz, delay)
     if sensors.joint_zero != 0.0:
         position += sensors.joint_zero
     position += noise
@@ -426,10 +429,10 @@ def _trajectory(
     states: list[str],
     control: Array,
 ) -> Trajectory:
-    columns = [np.ascontiguousarray(out[:, i]) for i in range(out.shape[1])]
+    columns = list(out)
     motor = columns[kernel.MEASURED_MOTOR]
     return Trajectory(
-        time_s=np.arange(out.shape[0]) / rate_hz,
+        time_s=np.arange(out.shape[1]) / rate_hz,
         torque=torque,
         motor_position=motor,
         joint_position=joint,

@@ -455,13 +455,14 @@ def run(  # type: ignore[no-untyped-def] # pragma: no cover
     inputs
         Polynomials of the input, shape (breakpoints, 6); without rows: closed loop.
     gains, reference
-        kp, kv, ki, velocity feed-forward, period; and the reference at the controller's instants.
+        kp, kv, ki, velocity feed-forward, period, integral at the start; and the reference at the controller's
+        instants.
     motor_sensor, motor_noise
         Resolution and delay; noise at each breakpoint.
     control
         As in `_interval`.
     out
-        The record, shape (rows, COLUMNS + states).
+        The record, shape (COLUMNS + states, rows): each column contiguous, so that nothing has to be copied later.
 
     Returns
     -------
@@ -485,7 +486,7 @@ def run(  # type: ignore[no-untyped-def] # pragma: no cover
     seen = np.empty(n)
     rates = np.empty(n)
     closed = inputs.shape[0] == 0
-    integral, before, before_reference = 0.0, 0.0, 0.0
+    integral, before, before_reference = gains[5], 0.0, 0.0
     for b in range(n):
         t = times[b]
         if not closed:
@@ -520,7 +521,7 @@ def run(  # type: ignore[no-untyped-def] # pragma: no cover
         if g[0] < 0.0 or g[1] < 0.0:
             _switch(t, x, k, g, g[0], g[1], w, p, laws, stages)
         if rows[b] >= 0:
-            _record(out[rows[b]], states, x, w, measured)
+            _record(out[:, rows[b]], states, x, w, measured)
         if b + 1 < n:
             status = _interval(t, times[b + 1], size, x, y, k, g, w, p, laws, stages, kinds, peaks, steering)
             if status != DONE:

@@ -144,12 +144,17 @@ ACCURATE = Solver(tolerance=1e-13)
 
 @dataclass(frozen=True)
 class InitialState:
-    """Where the simulation starts; what is not given is at rest, the spring carrying the load."""
+    """Where the simulation starts; what is not given is at rest, the spring carrying the load.
+
+    ``integral`` is that of the controller's velocity error, rad: a loop that was on before the record began holds
+    weight and friction with it.
+    """
 
     motor_position: float
     joint_position: float
     motor_velocity: float = 0.0
     joint_velocity: float = 0.0
+    integral: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import gzip
 import io
@@ -15,7 +16,7 @@ import numpy as np
 from flexid_cli.errors import OutputError
 from flexid_cli.writers.table import LogTable, finished_later
 
-_NANO = 1_000_000_000
+_DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 _LARGEST_EXACT_NS = 1 << 50  # below it, a float64 of seconds rounds back to the same nanosecond
 _ROWS = 4096
 
@@ -24,9 +25,14 @@ def write_csv(
     path: Path,
     table: LogTable,
     *,
-    time_name: str = "time",
-    time_unit: Literal["s", "ns"] | None = None,
+    time_name: str | None = "time",
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None,
+    time_place: int = 1,
     units_in_header: bool = True,
+    header: bool = True,
+    delimiter: str = ",",
+    decimal: Literal[".", ","] = ".",
+    encoding: str = "utf-8",
     overwrite: bool = False,
 ) -> None:
     """Write a table as CSV; a name that ends in ``.gz`` or ``.zst`` is packed.
@@ -40,52 +46,90 @@ def write_csv(
         The file.
     table : LogTable
         The channels; names are column names.
-    time_name : str
-        Name of the first column, the stamps.
-    time_unit : {"s", "ns"}, optional
+    time_name : str or None
+        Name of the column of stamps; None writes none.
+    time_unit : {"s", "ms", "us", "ns"}, optional
         Unit of the stamps. By default seconds, and nanoseconds where float64 seconds would lose some.
+    time_place : int
+        Which column holds the stamps, from 1.
     units_in_header : bool
         Whether the header has units: ``position [rad]``.
+    header : bool
+        Whether the first row holds the names.
+    delimiter, decimal, encoding : str
+        Column separator, decimal sign, text encoding.
     overwrite : bool
         Whether an existing file is replaced.
 
     Raises
     ------
     OutputError
-        The file exists, or cannot be written.
+        The file exists, cannot be written, or a name cannot be in this encoding.
     """
     if time_name in table.channels:
         raise OutputError(f"the name {time_name!r} is both the time's and a channel's", "rename one of them")
+    if decimal == delimiter:
+        raise OutputError(f"delimiter and decimal sign are both {decimal!r}", "separate columns by ;")
     if time_unit is None:
         largest = int(np.abs(table.stamps_ns).max(initial=0))
         time_unit = "s" if largest < _LARGEST_EXACT_NS else "ns"
-    units = {**table.units, time_name: time_unit} if units_in_header else {}
-    header = [f"{name} [{units[name]}]" if name in units else name for name in (time_name, *table.channels)]
+    units = {**table.units, str(time_name): time_unit} if units_in_header else {}
+    names: list[str | None] = list(table.channels)
+    if time_name is not None:
+        names.insert(min(max(time_place, 1) - 1, len(names)), time_name)
+    titles = [f"{name} [{units[str(name)]}]" if name in units else str(name) for name in names]
+    columns = [_texts(table, name, time_name, time_unit, decimal) for name in names]
     with finished_later(path, overwrite=overwrite) as draft:
         pack = _packer(path)
         with draft.open("wb") as stream:
-            for block in pack(_blocks(table, header, time_unit)):
+            blocks = _blocks(table.stamps_ns.size, titles if header else None, columns, delimiter)
+            for block in pack(_encoded(blocks, encoding)):
                 stream.write(block)
 
 
-def _blocks(table: LogTable, header: list[str], time_unit: str) -> Iterator[bytes]:
-    stamp = _seconds if time_unit == "s" else str
-    for start in range(0, max(table.stamps_ns.size, 1), _ROWS):
+def _texts(
+    table: LogTable, name: str | None, time_name: str | None, time_unit: str, decimal: str
+) -> Callable[[slice], list[str]]:
+    """How the rows of one column are written."""
+    if name == time_name:
+        digits = _DIGITS[time_unit]
+        return lambda rows: [_stamp(time, digits, decimal) for time in table.stamps_ns[rows].tolist()]
+    values = table.channels[str(name)]
+    if decimal == ".":
+        return lambda rows: [_number(value) for value in values[rows].tolist()]
+    return lambda rows: [_number(value).replace(".", decimal) for value in values[rows].tolist()]
+
+
+def _blocks(
+    count: int, titles: list[str] | None, columns: list[Callable[[slice], list[str]]], delimiter: str
+) -> Iterator[str]:
+    for start in range(0, max(count, 1), _ROWS):
         text = io.StringIO(newline="")
-        writer = csv.writer(text, lineterminator="\n")
-        if start == 0:
-            writer.writerow(header)
-        part = slice(start, start + _ROWS)
-        columns = [[_number(value) for value in values[part].tolist()] for values in table.channels.values()]
-        times = [stamp(time) for time in table.stamps_ns[part].tolist()]
-        writer.writerows(zip(times, *columns, strict=True))
-        yield text.getvalue().encode()
+        writer = csv.writer(text, delimiter=delimiter, lineterminator="\n")
+        if start == 0 and titles is not None:
+            writer.writerow(titles)
+        rows = slice(start, start + _ROWS)
+        writer.writerows(zip(*(column(rows) for column in columns), strict=True))
+        yield text.getvalue()
 
 
-def _seconds(time_ns: int) -> str:
-    whole, rest = divmod(abs(time_ns), _NANO)
-    text = f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}".rstrip("0")
-    return f"{text}0" if text.endswith(".") else text
+def _encoded(blocks: Iterator[str], encoding: str) -> Iterator[bytes]:
+    encoder = codecs.getincrementalencoder(encoding)()  # writes a byte order mark once, where there is one
+    try:
+        for block in blocks:
+            yield encoder.encode(block)
+    except UnicodeEncodeError as error:
+        wrong = error.object[error.start : error.end]
+        raise OutputError(f"{wrong!r} cannot be written in {encoding}", "use utf-8") from error
+
+
+def _stamp(time_ns: int, digits: int, decimal: str) -> str:
+    """Nanoseconds in a unit of ``10**digits`` of them, exactly."""
+    if digits == 0:
+        return str(time_ns)
+    whole, rest = divmod(abs(time_ns), 10**digits)
+    text = f"{'-' if time_ns < 0 else ''}{whole}{decimal}{rest:0{digits}d}".rstrip("0")
+    return f"{text}0" if text.endswith(decimal) else text
 
 
 def _number(value: float) -> str:

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from scipy.stats import norm
 
 from flexid_cli.config.load import load_config
 from flexid_cli.estimate.identify import identify
@@ -71,10 +72,13 @@ def test_the_script_makes_these_logs(folder, tmp_path):
 def test_every_identified_interval_holds_the_truth(found, model):
     models, truth = found
     identified = [e for e in models[model].parameters if e.verdict == "identified"]
+    # One of some ten 95 % intervals may well miss: they are widened to hold all at once with 95 % (Bonferroni). How
+    # often each holds is measured over many records, in tests/statistical.
+    wider = norm.ppf(1.0 - 0.025 / len(identified)) / norm.ppf(0.975)
     missed = [
         (e.symbol, e.interval.low, truth[e.symbol], e.interval.high)
         for e in identified
-        if not e.interval.low <= truth[e.symbol] <= e.interval.high
+        if abs(truth[e.symbol] - e.value) > wider * 0.5 * (e.interval.high - e.interval.low)
     ]
     assert not missed
     assert {"Jm", "K", "JL"} <= {e.symbol for e in identified}

@@ -23,14 +23,27 @@ Literature
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.motion import Base, Motion, Terms
+from flexid_cli.effects.signature import Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     q = w[slots.JOINT_POSITION]
     w[slots.LOAD_TORQUE] += w[slots.GRAVITY] * (p[0] * math.cos(q) + p[1] * math.sin(q))
+
+
+def _columns(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(load=m.gravity * np.column_stack([np.cos(m.joint_position), np.sin(m.joint_position)]))
+
+
+def _values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    return {"gravity_moment_x": float(a[0]), "gravity_moment_y": float(a[1])}
 
 
 EFFECT = Effect(
@@ -48,4 +61,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.LOAD, _torque),),
     energy="conserves",
+    signatures=(Signature(_columns, _values, motor_alone=True),),
 )

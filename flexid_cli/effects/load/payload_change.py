@@ -22,9 +22,13 @@ Literature
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
@@ -35,6 +39,18 @@ def _torque(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
             q = w[slots.JOINT_POSITION]
             w[slots.LOAD_INERTIA] += p[0]
             w[slots.LOAD_TORQUE] += w[slots.GRAVITY] * (p[1] * math.cos(q) + p[2] * math.sin(q))
+
+
+def _columns(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(load=column(m.joint_acceleration * (m.time_s > shape[0])))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape]:
+    return (Shape("time_of_change", 0.05 * scale.duration_s, 0.95 * scale.duration_s, 40, "linear"),)
+
+
+def _values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
+    return {"inertia_change": float(a[0]), "time_of_change": shape[0]}
 
 
 EFFECT = Effect(
@@ -55,4 +71,5 @@ EFFECT = Effect(
     laws=(Law(Stage.LOAD, _torque),),
     guards=1,
     energy="exchanges",
+    signatures=(Signature(_columns, _values, _shapes),),
 )

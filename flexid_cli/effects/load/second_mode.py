@@ -23,8 +23,15 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, EffectState, Law, Stage
+from flexid_cli.effects.forms import column, resonant
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, x: Array, dx: Array, _g: Array) -> None:
@@ -36,6 +43,29 @@ def _torque(w: Array, p: Array, x: Array, dx: Array, _g: Array) -> None:
     else:
         dx[0] = 0.0
         dx[1] = 0.0
+
+
+def _columns(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(load=column(resonant(m.joint_acceleration, shape[0], shape[1], m.period_s)))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape]:
+    high = min(1.3 * scale.band_hz, 0.45 / scale.period_s)
+    return (
+        Shape("frequency", 0.3 * scale.resonance_hz, high, 28),
+        Shape("damping_ratio", 0.01, 0.3, 2),
+    )
+
+
+def _values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
+    inertia = float(a[0])
+    w = 2.0 * np.pi * shape[0]
+    stiffness = inertia * w**2
+    return {
+        "second_inertia": inertia,
+        "second_stiffness": stiffness,
+        "second_damping": 2.0 * shape[1] * w * inertia,
+    }
 
 
 EFFECT = Effect(
@@ -54,4 +84,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.LOAD, _torque),),
     states=(EffectState("position", "joint_position"), EffectState("velocity", "joint_velocity")),
+    signatures=(Signature(_columns, _values, _shapes, sign=1),),
 )

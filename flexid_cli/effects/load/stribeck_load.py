@@ -23,14 +23,33 @@ Literature
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     ratio = w[slots.JOINT_VELOCITY] / p[1]
     w[slots.LOAD_COULOMB] += p[0] * math.exp(-ratio * ratio)
+
+
+def _columns(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(load=column(m.joint_sign * np.exp(-((m.joint_velocity / shape[0]) ** 2))))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape]:
+    low = max(2.0 * scale.base.load_reversal, 0.01 * scale.joint_speed)
+    return (Shape("stribeck_velocity", low, 0.6 * scale.joint_speed, 12),)
+
+
+def _values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
+    return {"stribeck_torque": float(a[0]), "stribeck_velocity": shape[0]}
 
 
 EFFECT = Effect(
@@ -47,4 +66,5 @@ EFFECT = Effect(
     best_recording="Slow sweeps with many reversals, with both encoders.",
     text=__doc__,
     laws=(Law(Stage.LOAD, _torque),),
+    signatures=(Signature(_columns, _values, _shapes, sign=1),),
 )

@@ -23,12 +23,25 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Terms
+from flexid_cli.effects.signature import Signature
 
 
 def _measurement(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     w[slots.JOINT_DELAY] += p[0]
+
+
+def _columns(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(joint_error=column(-m.joint_velocity))
+
+
+def _values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    return {"skew": float(a[0])}
 
 
 EFFECT = Effect(
@@ -43,4 +56,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.MEASUREMENT, _measurement),),
     energy="conserves",
+    signatures=(Signature(_columns, _values, needs_joint=True),),
 )

@@ -22,9 +22,15 @@ Literature
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import amplitude_and_phase, sines
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _measurement(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
@@ -34,6 +40,30 @@ def _measurement(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     motor = p[4] * w[slots.MEASURED_MOTOR] + p[3]
     w[slots.MEASURED_MOTOR] += p[2] * math.sin(motor)
     w[slots.MEASURED_MOTOR_RATE] *= 1.0 + p[2] * p[4] * math.cos(motor)
+
+
+def _joint(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(joint_error=sines(m.joint_position, 1.0))
+
+
+def _joint_values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    size, phase = amplitude_and_phase(a)
+    return {"joint_amplitude": size, "joint_phase": phase}
+
+
+def _motor(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(motor_error=sines(m.motor_position, m.gear_ratio))
+
+
+def _once_a_turn(scale: Scale) -> Sequence[Shape] | None:
+    """Nothing to search; without a gear, or over less than two turns, it is no ripple."""
+    turns = scale.gear_ratio * scale.motor_range / (2.0 * np.pi)
+    return () if scale.gear_ratio > 1.0 and turns > 2.0 else None
+
+
+def _motor_values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    size, phase = amplitude_and_phase(a)
+    return {"motor_amplitude": size, "motor_phase": phase}
 
 
 EFFECT = Effect(
@@ -54,4 +84,8 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.MEASUREMENT, _measurement),),
     energy="exchanges",
+    signatures=(
+        Signature(_joint, _joint_values, needs_joint=True),
+        Signature(_motor, _motor_values, _once_a_turn),
+    ),
 )

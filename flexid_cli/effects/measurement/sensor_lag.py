@@ -22,8 +22,13 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, EffectState, Law, Stage
+from flexid_cli.effects.forms import column, lagged
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _measurement(w: Array, p: Array, x: Array, dx: Array, _g: Array) -> None:
@@ -37,6 +42,26 @@ def _measurement(w: Array, p: Array, x: Array, dx: Array, _g: Array) -> None:
         dx[1] = (w[slots.MEASURED_MOTOR] - x[1]) / p[1]
         w[slots.MEASURED_MOTOR] = x[1]
         w[slots.MEASURED_MOTOR_RATE] = dx[1]
+
+
+def _joint(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(joint_error=column(lagged(m.joint_position, shape[0], m.period_s) - m.joint_position))
+
+
+def _motor(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(motor_error=column(lagged(m.motor_position, shape[0], m.period_s) - m.motor_position))
+
+
+def _lags(scale: Scale) -> Sequence[Shape]:
+    return (Shape("lag", 0.1 * scale.period_s, 0.1 / scale.resonance_hz, 10),)
+
+
+def _joint_values(_: Array, shape: Sequence[float], __: Base) -> dict[str, float]:
+    return {"joint_lag": shape[0]}
+
+
+def _motor_values(_: Array, shape: Sequence[float], __: Base) -> dict[str, float]:
+    return {"motor_lag": shape[0]}
 
 
 EFFECT = Effect(
@@ -55,4 +80,8 @@ EFFECT = Effect(
     laws=(Law(Stage.MEASUREMENT, _measurement),),
     states=(EffectState("joint", "joint_position"), EffectState("motor", "motor_position")),
     energy="exchanges",
+    signatures=(
+        Signature(_joint, _joint_values, _lags, fixed=1.0, needs_joint=True),
+        Signature(_motor, _motor_values, _lags, fixed=1.0, needs_joint=True),
+    ),
 )

@@ -23,12 +23,15 @@ Literature
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, EffectState, Law, Stage
+from flexid_cli.effects.forms import column, lagged
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, x: Array, dx: Array, _g: Array) -> None:
@@ -42,6 +45,18 @@ def _torque(w: Array, p: Array, x: Array, dx: Array, _g: Array) -> None:
 def _command(torque: Array, rate_hz: float, values: Mapping[str, float]) -> Array:
     """Command that a first-order lag turns into this torque."""
     return torque + values["lag"] * np.gradient(torque) * rate_hz
+
+
+def _columns(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(motor=column(m.torque - lagged(m.torque, shape[0], m.period_s)))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape]:
+    return (Shape("lag", 0.15 * scale.period_s, 0.25 / scale.resonance_hz, 12),)
+
+
+def _values(_: Array, shape: Sequence[float], __: Base) -> dict[str, float]:
+    return {"lag": shape[0]}
 
 
 EFFECT = Effect(
@@ -58,4 +73,5 @@ EFFECT = Effect(
     states=(EffectState("acting_torque"),),
     energy="exchanges",
     command=_command,
+    signatures=(Signature(_columns, _values, _shapes, fixed=1.0),),
 )

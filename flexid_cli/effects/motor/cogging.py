@@ -26,13 +26,30 @@ Literature
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import amplitude_and_phase, cycles_range, sines
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     w[slots.MOTOR_TORQUE] += p[0] * math.sin(p[1] * w[slots.MOTOR_POSITION] + p[2])
+
+
+def _columns(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(motor=sines(m.motor_position, shape[0]))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape] | None:
+    return cycles_range(scale, "cogging_cycles")
+
+
+def _values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
+    size, phase = amplitude_and_phase(a)
+    return {"cogging_torque": size, "cogging_cycles": shape[0], "cogging_phase": phase}
 
 
 EFFECT = Effect(
@@ -51,4 +68,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.MOTOR, _torque),),
     energy="conserves",
+    signatures=(Signature(_columns, _values, _shapes, ripple="motor"),),
 )

@@ -23,14 +23,29 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Terms
+from flexid_cli.effects.signature import Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
     torque = w[slots.JOINT_TORQUE]
     w[slots.MOTOR_COULOMB] += p[0] * abs(torque)
     g[0] = 1.0 if p[0] == 0.0 else torque
+
+
+def _columns(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(motor=column(np.abs(m.base.K * m.deflection) * m.motor_sign))
+
+
+def _values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    return {"load_friction_coefficient": float(a[0])}
 
 
 EFFECT = Effect(
@@ -45,4 +60,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.MOTOR, _torque),),
     guards=1,
+    signatures=(Signature(_columns, _values, sign=1),),
 )

@@ -24,14 +24,34 @@ Literature
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     ratio = w[slots.MOTOR_VELOCITY] / p[1]
     w[slots.MOTOR_COULOMB] += p[0] * math.exp(-ratio * ratio)
+
+
+def _columns(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(motor=column(m.motor_sign * np.exp(-((m.motor_velocity / shape[0]) ** 2))))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape]:
+    # Narrower than the reversal it would be part of it; wider than the speeds it would be Coulomb friction.
+    low = max(2.0 * scale.base.motor_reversal, 0.01 * scale.motor_speed)
+    return (Shape("stribeck_velocity", low, 0.6 * scale.motor_speed, 12),)
+
+
+def _values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
+    return {"stribeck_torque": float(a[0]), "stribeck_velocity": shape[0]}
 
 
 EFFECT = Effect(
@@ -48,4 +68,5 @@ EFFECT = Effect(
     best_recording="Slow sweeps with many reversals, much of the time below the Stribeck velocity.",
     text=__doc__,
     laws=(Law(Stage.MOTOR, _torque),),
+    signatures=(Signature(_columns, _values, _shapes, sign=1),),
 )

@@ -24,14 +24,32 @@ Literature
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     change = p[0] * (math.exp(-w[slots.TIME] / p[1]) - 1.0)
     w[slots.MOTOR_TORQUE] += w[slots.FVM] * change * w[slots.MOTOR_VELOCITY]
+
+
+def _columns(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(motor=column(m.motor_velocity * np.expm1(-m.time_s / shape[0])))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape]:
+    return (Shape("warming_time", 0.05 * scale.duration_s, 5.0 * scale.duration_s, 8),)
+
+
+def _values(a: Array, shape: Sequence[float], base: Base) -> dict[str, float]:
+    return {"friction_change": float(a[0]) / base.FVm, "warming_time": shape[0]}
 
 
 EFFECT = Effect(
@@ -49,4 +67,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.MOTOR, _torque),),
     energy="exchanges",
+    signatures=(Signature(_columns, _values, _shapes),),
 )

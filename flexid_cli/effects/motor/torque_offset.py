@@ -23,12 +23,26 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.motion import Base, Motion, Terms
+from flexid_cli.effects.signature import Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     w[slots.MOTOR_TORQUE] += p[0]
+
+
+def _columns(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(motor=np.ones((m.torque.size, 1)))
+
+
+def _values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    return {"torque_offset": float(a[0])}
 
 
 EFFECT = Effect(
@@ -43,4 +57,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.MOTOR, _torque),),
     energy="conserves",
+    signatures=(Signature(_columns, _values),),
 )

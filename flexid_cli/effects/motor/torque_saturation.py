@@ -24,9 +24,15 @@ Literature
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+import numpy as np
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
@@ -36,6 +42,18 @@ def _torque(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
         w[slots.TORQUE] = p[0]
     elif torque < -p[0]:
         w[slots.TORQUE] = -p[0]
+
+
+def _columns(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(motor=column(m.torque - np.clip(m.torque, -shape[0], shape[0])))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape]:
+    return (Shape("torque_limit", 0.3 * scale.torque, 0.999 * scale.torque, 16, "linear"),)
+
+
+def _values(_: Array, shape: Sequence[float], __: Base) -> dict[str, float]:
+    return {"torque_limit": shape[0]}
 
 
 EFFECT = Effect(
@@ -51,4 +69,5 @@ EFFECT = Effect(
     laws=(Law(Stage.LIMIT, _torque),),
     guards=1,
     energy="exchanges",
+    signatures=(Signature(_columns, _values, _shapes, fixed=1.0),),
 )

@@ -23,14 +23,29 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Terms
+from flexid_cli.effects.signature import Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
     velocity = w[slots.MOTOR_VELOCITY]
     w[slots.MOTOR_TORQUE] += p[0] * abs(velocity)
     g[0] = 1.0 if p[0] == 0.0 else velocity
+
+
+def _columns(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(motor=column(np.abs(m.motor_velocity)))
+
+
+def _values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    return {"viscous_asymmetry": float(a[0])}
 
 
 EFFECT = Effect(
@@ -46,4 +61,5 @@ EFFECT = Effect(
     laws=(Law(Stage.MOTOR, _torque),),
     guards=1,
     energy="exchanges",
+    signatures=(Signature(_columns, _values),),
 )

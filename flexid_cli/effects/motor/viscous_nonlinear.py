@@ -23,8 +23,15 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
@@ -32,6 +39,34 @@ def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     w[slots.MOTOR_TORQUE] += p[0] * velocity * abs(velocity)
     if p[1] != 0.0:
         w[slots.MOTOR_COULOMB] += p[1] * abs(velocity) ** p[2]
+
+
+VISCOUS = (0.8, 1.25)  # exponents that cannot be told from viscous friction
+
+
+def _quadratic(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(motor=column(m.motor_velocity * np.abs(m.motor_velocity)))
+
+
+def _power(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(motor=column(m.motor_sign * np.abs(m.motor_velocity) ** shape[0]))
+
+
+def _quadratic_values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    return {"quadratic_friction": float(a[0])}
+
+
+def _power_values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
+    return {"power_friction": float(a[0]), "power_exponent": shape[0]}
+
+
+def _power_tied(_: Array, shape: Sequence[float], __: Base) -> str:
+    low, high = VISCOUS
+    return "its exponent is that of viscous friction" if low < shape[0] < high else ""
+
+
+def _exponents(_: Scale) -> Sequence[Shape]:
+    return (Shape("power_exponent", 0.25, 3.0, 12, "linear"),)
 
 
 EFFECT = Effect(
@@ -49,4 +84,8 @@ EFFECT = Effect(
     best_recording="Constant speeds from the lowest to the highest in both directions, at one temperature.",
     text=__doc__,
     laws=(Law(Stage.MOTOR, _torque),),
+    signatures=(
+        Signature(_quadratic, _quadratic_values),
+        Signature(_power, _power_values, _exponents, tied=_power_tied),
+    ),
 )

@@ -24,8 +24,15 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _contact(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
@@ -44,6 +51,34 @@ def _contact(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
             w[slots.SPRING_TORSION] = 0.0
 
 
+INNER_STIFFNESS = 0.35  # over the outer one: stiffer than that inside the gap, and it is no gap
+
+
+def _columns(m: Motion, shape: Sequence[float]) -> Terms:
+    half = 0.5 * shape[0]
+    return Terms(transmission=column(-np.clip(m.deflection - shape[1], -half, half)))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape]:
+    low = max(scale.deflection_noise, 0.004 * scale.deflection)
+    centre = 0.3 * scale.deflection
+    return (
+        Shape("gap", low, 1.2 * scale.deflection, 12),
+        Shape("centre", -centre, centre, 1, "linear"),
+    )
+
+
+def _values(_: Array, shape: Sequence[float], __: Base) -> dict[str, float]:
+    return {"gap": shape[0]}
+
+
+def _tied(a: Array, _: Sequence[float], base: Base) -> str:
+    inner = 1.0 - float(a[0]) / base.K
+    if abs(inner) < INNER_STIFFNESS:
+        return ""
+    return f"inside the gap the stiffness would be {inner:.2g} of the outer one"
+
+
 EFFECT = Effect(
     code="FX202",
     name="backlash",
@@ -57,4 +92,5 @@ EFFECT = Effect(
     laws=(Law(Stage.CONTACT, _contact),),
     guards=2,
     energy="conserves",
+    signatures=(Signature(_columns, _values, _shapes, sign=1, tied=_tied),),
 )

@@ -25,8 +25,15 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
@@ -41,6 +48,34 @@ def _torque(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
             w[slots.JOINT_TORQUE] += p[1] * (torsion - p[2])
         elif torsion < -p[2]:
             w[slots.JOINT_TORQUE] += p[1] * (torsion + p[2])
+
+
+def _cubic(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(transmission=column(m.deflection**3))
+
+
+def _cubic_values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    return {"cubic_stiffness": float(a[0])}
+
+
+def _knee(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(transmission=column(m.deflection - np.clip(m.deflection, -shape[0], shape[0])))
+
+
+def _knees(scale: Scale) -> Sequence[Shape]:
+    return (Shape("knee_torsion", 0.1 * scale.deflection, 0.9 * scale.deflection, 8),)
+
+
+def _knee_values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
+    return {"knee_stiffness": float(a[0]), "knee_torsion": shape[0]}
+
+
+def _knee_tied(a: Array, _: Sequence[float], base: Base) -> str:
+    return (
+        ""
+        if 0.35 * (base.K + float(a[0])) < base.K
+        else "the spring below its knee would be nearly free, a gap"
+    )
 
 
 EFFECT = Effect(
@@ -60,4 +95,8 @@ EFFECT = Effect(
     laws=(Law(Stage.TRANSMISSION, _torque),),
     guards=2,
     energy="conserves",
+    signatures=(
+        Signature(_cubic, _cubic_values, sign=1),
+        Signature(_knee, _knee_values, _knees, sign=1, tied=_knee_tied),
+    ),
 )

@@ -26,8 +26,16 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, EffectState, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _torque(w: Array, p: Array, x: Array, dx: Array, g: Array) -> None:
@@ -35,6 +43,46 @@ def _torque(w: Array, p: Array, x: Array, dx: Array, g: Array) -> None:
     dx[0] = (p[0] * rate - abs(rate) * x[0]) / p[1]
     w[slots.JOINT_TORQUE] += x[0]
     g[0] = 1.0 if p[0] == 0.0 else rate
+
+
+@njit(cache=True)
+def _dahl(torsion: Array, length: float, out: Array) -> None:  # pragma: no cover
+    state = 0.0
+    for i in range(1, torsion.size):
+        step = torsion[i] - torsion[i - 1]
+        end = 1.0 if step > 0.0 else -1.0
+        # Exact while the direction stays the same.
+        state = end + (state - end) * np.exp(-abs(step) / length)
+        out[i] = state
+
+
+@njit(cache=True)
+def _slip(torsion: Array, length: float, out: Array) -> None:  # pragma: no cover
+    state = 0.0
+    for i in range(1, torsion.size):
+        state = min(1.0, max(-1.0, state + (torsion[i] - torsion[i - 1]) / length))
+        out[i] = state
+
+
+def _dahl_columns(m: Motion, shape: Sequence[float]) -> Terms:
+    state = np.zeros(m.deflection.size)
+    _dahl(m.deflection, shape[0], state)
+    return Terms(transmission=column(state))
+
+
+def _slip_columns(m: Motion, shape: Sequence[float]) -> Terms:
+    state = np.zeros(m.deflection.size)
+    _slip(m.deflection, shape[0], state)
+    return Terms(transmission=column(state))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape]:
+    low = max(2.0 * scale.deflection_noise, 0.01 * scale.deflection)
+    return (Shape("hysteresis_length", low, 1.5 * scale.deflection, 10),)
+
+
+def _values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
+    return {"hysteresis_torque": float(a[0]), "hysteresis_length": shape[0]}
 
 
 EFFECT = Effect(
@@ -53,4 +101,8 @@ EFFECT = Effect(
     laws=(Law(Stage.TRANSMISSION, _torque),),
     states=(EffectState("z"),),
     guards=1,
+    signatures=(
+        Signature(_dahl_columns, _values, _shapes, sign=1),
+        Signature(_slip_columns, _values, _shapes, sign=1),
+    ),
 )

@@ -24,12 +24,25 @@ Literature
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Terms
+from flexid_cli.effects.signature import Signature
 
 
 def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     w[slots.JOINT_TORQUE] += p[0] * w[slots.TORSION_RATE]
+
+
+def _columns(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(transmission=column(m.deflection_rate))
+
+
+def _values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    return {"joint_damping": float(a[0])}
 
 
 EFFECT = Effect(
@@ -43,4 +56,5 @@ EFFECT = Effect(
     best_recording="A multisine around the first resonance, with both encoders.",
     text=__doc__,
     laws=(Law(Stage.TRANSMISSION, _torque),),
+    signatures=(Signature(_columns, _values, sign=1),),
 )

@@ -24,9 +24,13 @@ Literature
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
+from flexid_cli.effects.forms import amplitude_and_phase, cycles_range, sines
+from flexid_cli.effects.motion import Base, Motion, Shape, Terms
+from flexid_cli.effects.signature import Scale, Signature
 
 
 def _kinematics(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
@@ -35,6 +39,19 @@ def _kinematics(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     w[slots.TORSION] += p[0] * math.sin(angle)
     w[slots.TORSION_RATE] += ratio * w[slots.MOTOR_VELOCITY]
     w[slots.GEAR] += ratio  # power conserving: the motor feels T times the derivative of d
+
+
+def _columns(m: Motion, shape: Sequence[float]) -> Terms:
+    return Terms(transmission=m.base.K * sines(m.motor_position, shape[0]))
+
+
+def _shapes(scale: Scale) -> Sequence[Shape] | None:
+    return cycles_range(scale, "error_cycles")
+
+
+def _values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
+    size, phase = amplitude_and_phase(a)
+    return {"error_amplitude": size, "error_cycles": shape[0], "error_phase": phase}
 
 
 EFFECT = Effect(
@@ -53,4 +70,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.KINEMATICS, _kinematics),),
     energy="conserves",
+    signatures=(Signature(_columns, _values, _shapes, ripple="transmission"),),
 )
