@@ -36,6 +36,8 @@ class Scale:
         98 % quantile of the absolute velocity.
     motor_range, joint_range : float
         Largest minus smallest position.
+    motor_reversal_step, joint_reversal_step : float
+        Velocity that passes within the reach of the filters where it reverses: nothing narrower is resolved.
     deflection : float
         99 % quantile of the absolute torsion about its zero.
     deflection_noise : float
@@ -59,6 +61,8 @@ class Scale:
     joint_speed: float
     motor_range: float
     joint_range: float
+    motor_reversal_step: float
+    joint_reversal_step: float
     deflection: float
     deflection_noise: float
     torque: float

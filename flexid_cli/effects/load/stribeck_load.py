@@ -44,7 +44,7 @@ def _columns(m: Motion, shape: Sequence[float]) -> Terms:
 
 
 def _shapes(scale: Scale) -> Sequence[Shape]:
-    low = max(2.0 * scale.base.load_reversal, 0.01 * scale.joint_speed)
+    low = max(2.0 * scale.base.load_reversal, 2.0 * scale.joint_reversal_step, 0.01 * scale.joint_speed)
     return (Shape("stribeck_velocity", low, 0.6 * scale.joint_speed, 12),)
 
 

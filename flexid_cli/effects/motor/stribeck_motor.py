@@ -45,8 +45,9 @@ def _columns(m: Motion, shape: Sequence[float]) -> Terms:
 
 
 def _shapes(scale: Scale) -> Sequence[Shape]:
-    # Narrower than the reversal it would be part of it; wider than the speeds it would be Coulomb friction.
-    low = max(2.0 * scale.base.motor_reversal, 0.01 * scale.motor_speed)
+    # Narrower than the reversal, or than what the filters resolve of it, it would be part of it; as wide as the
+    # speeds it would be Coulomb friction.
+    low = max(2.0 * scale.base.motor_reversal, 2.0 * scale.motor_reversal_step, 0.01 * scale.motor_speed)
     return (Shape("stribeck_velocity", low, 0.6 * scale.motor_speed, 12),)
 
 

@@ -1,0 +1,247 @@
+"""From two views of one axis, model and recording, to what physics the model left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexid_cli.diagnose import evidence, verdict
+from flexid_cli.diagnose.estimates import base_estimates, effect_estimates, solved
+from flexid_cli.diagnose.figures import residual_map, traces
+from flexid_cli.diagnose.fitter import Fitted, Fitter
+from flexid_cli.diagnose.location import Map, located, residual_maps
+from flexid_cli.diagnose.physical import torque_scale
+from flexid_cli.diagnose.result import Diagnosis, Evidence, HeldOut, NamedEffect, Tested, Where
+from flexid_cli.diagnose.search import Form
+from flexid_cli.diagnose.selection import ENOUGH, Selection, select
+from flexid_cli.diagnose.simulation import simulation_error
+from flexid_cli.diagnose.start import first_problem
+from flexid_cli.effects.base import EffectValues
+from flexid_cli.effects.registry import effects as library
+
+if TYPE_CHECKING:
+    from flexid_cli.config.schema import Config
+    from flexid_cli.signals.recording import Recording
+
+Array = NDArray[np.float64]
+
+
+def diagnose(
+    recording: Recording,
+    config: Config,
+    validation: Recording | None = None,
+) -> Diagnosis:
+    """Find where the declared baseline and a recording differ, and what was left out.
+
+    Parameters
+    ----------
+    recording : Recording
+        Joint side, SI; with both encoders the baseline is eq. (13), else eq. (18) without gravity and offset.
+    config : Config
+        Axis, signals and confidence level.
+    validation : Recording, optional
+        Another recording of the axis: effects fitted to the first one are checked on it.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    DataError
+        The recording is too short, or shows no flexible axis at all.
+    """
+    both = recording.has_joint_position
+    fitter = Fitter(_forms(both), _holds(config))
+    problem = first_problem(recording, config.axis.gravity_m_per_s2, config.axis.gear_ratio, fitter)
+    selection = select(fitter, problem)
+    return _Report(fitter, selection, recording, config, validation).diagnosis()
+
+
+def _forms(both: bool) -> list[Form]:
+    return [
+        Form(effect, k)
+        for effect in library()
+        for k, signature in enumerate(effect.signatures)
+        if not (signature.motor_alone if both else signature.needs_joint)
+    ]
+
+
+def _holds(config: Config) -> tuple[bool, ...]:
+    """Holds that may be: one that is declared has been taken into account already."""
+    torque = config.signals.torque
+    return (False,) if torque.hold is not None or torque.delay_s is not None else (False, True)
+
+
+class _Report:
+    """Everything that a selection is reported with."""
+
+    def __init__(
+        self,
+        fitter: Fitter,
+        selection: Selection,
+        recording: Recording,
+        config: Config,
+        validation: Recording | None,
+    ) -> None:
+        self.fitter, self.selection, self.recording, self.config = fitter, selection, recording, config
+        self.units = {"linear": recording.linear, "torque_unit": recording.torque_unit}
+        self.level = config.estimate.confidence_level
+        after = selection.after
+        remaining = residual_maps(after.problem, after.basis)
+        unexplained = verdict.is_unexplained(after.basis.rms, remaining)
+        self.verdict = verdict.decide(selection, unexplained)
+        # What does not explain the record is not named: the baseline stands, and the place of its mismatch.
+        self.final: Fitted = selection.before if unexplained else after
+        self.maps = residual_maps(selection.before.problem, selection.before.basis)
+        self.other = None
+        if validation is not None:
+            self.other = first_problem(
+                validation, config.axis.gravity_m_per_s2, config.axis.gear_ratio, fitter
+            )
+
+    def diagnosis(self) -> Diagnosis:
+        """Assemble the result."""
+        before, after = self.selection.before, self.final
+        solved_before = solved(before)
+        solved_after = solved(after) if after is not before else solved_before
+        named = self._effects(solved_after)
+        held_out = self._held_out()
+        parameters_before = base_estimates(before, solved_before, level=self.level, **self.units)
+        parameters_after = base_estimates(after, solved_after, level=self.level, **self.units)
+        place = self._place()
+        share = 1.0 - max(after.cost - after.y.size, 0.0) / max(before.cost - before.y.size, 1e-300)
+        equation, variable = (place.equation, place.variable) if place else ("motor", "velocity")
+        return Diagnosis(
+            verdict=self.verdict,
+            sentence=verdict.sentence(self.verdict, named, equation, variable, share),
+            model="two_encoders" if before.problem.both else "motor_only",
+            effects=named,
+            location=place if self.verdict == "unexplained" else None,
+            held_out=held_out,
+            simulation=self._simulation(parameters_before, parameters_after),
+            parameters_before=parameters_before,
+            parameters_after=parameters_after,
+            tested=self._tested(),
+            next_recording=verdict.advice(
+                named, {e.name: e.best_recording for e in library()}, self.verdict, variable
+            ),
+            notes=self._notes(),
+            traces=traces(before, after, self.recording.torque_unit),
+            maps=tuple(residual_map(before, after, m, self.recording) for m in self.maps[:1]),
+        )
+
+    def _effects(self, result: object) -> tuple[NamedEffect, ...]:
+        final = self.final
+        if not final.chosen:
+            return ()
+        gains = evidence.gains(self.fitter, final)
+        validated = self._validated(final)
+        named = []
+        for k, chosen in enumerate(final.chosen):
+            score = evidence.score(self.fitter, final, k, len(self.fitter.forms))
+            effect = chosen.form.effect
+            alternatives = tuple(f.chosen[-1].name for f in self.selection.alternatives[k])
+            named.append(
+                NamedEffect(
+                    name=effect.name,
+                    code=effect.code,
+                    family=effect.family,
+                    alternatives=tuple(dict.fromkeys(alternatives)),
+                    parameters=effect_estimates(final, k, result, level=self.level, **self.units),
+                    evidence=Evidence(gains[k], ENOUGH, score.p_value, validated, score.stability),
+                    where=Where(effect.equation, _variable(effect.equation, self.maps)),
+                )
+            )
+        order = np.argsort(gains)[::-1]
+        return tuple(named[int(k)] for k in order)
+
+    def _validated(self, final: Fitted) -> float:
+        before, after = self._unseen(final)
+        return evidence.held_out_gain(before, after)
+
+    def _unseen(self, final: Fitted) -> tuple[Array, Array]:
+        """Residual rows of both models on data that they were not fitted to."""
+        if self.other is None:
+            return evidence.cross_validated(self.fitter, self.selection.before, final)
+        first = evidence.predicted(self.other, self.fitter, self.selection.before)
+        return first, evidence.predicted(self.other, self.fitter, final)
+
+    def _held_out(self) -> HeldOut:
+        before, after = self._unseen(self.final)
+        problem = self.final.problem
+        scale = torque_scale(problem)
+
+        def rms(rows: Array) -> dict[str, float]:
+            parts = evidence.by_equation(problem, rows)
+            return {name: scale[name] * float(np.sqrt(np.mean(part**2))) for name, part in parts.items()}
+
+        data = "blocks of the record" if self.other is None else "the other recording"
+        return HeldOut(rms(before), rms(after), dict(scale), data, self.recording.torque_unit)
+
+    def _simulation(self, before: tuple, after: tuple) -> object:
+        final = self.final
+        values = [
+            EffectValues(
+                c.name,
+                c.form.signature.values(np.atleast_1d(final.amplitudes(k)), c.shape, final.problem.base),
+            )
+            for k, c in enumerate(final.chosen)
+        ]
+        position = "m" if self.recording.linear else "rad"
+        return simulation_error(
+            final.problem,
+            {e.symbol: e.value for e in before if e.value is not None},
+            {e.symbol: e.value for e in after if e.value is not None},
+            values,
+            unit=self.recording.torque_unit,
+            position_unit=position,
+        )
+
+    def _place(self) -> Where | None:
+        return located(self.selection.before, self.maps[0], self.recording) if self.maps else None
+
+    def _tested(self) -> tuple[Tested, ...]:
+        chosen = {c.name for c in self.final.chosen}
+        met = {c.form.name: c for c in self.selection.tested}
+        rivals: Mapping[str, float] = {n: w for group in self.selection.rivals for n, w in group}
+        alternatives = {f.chosen[-1].name for group in self.selection.alternatives for f in group}
+        dropped = {c.name for c in self.selection.after.chosen} - chosen
+        out = []
+        for effect in library():
+            candidate = met.get(effect.name)
+            if effect.name in chosen:
+                reason = ""
+            elif effect.name in dropped:
+                reason = "with it the model still leaves structure that it does not explain"
+            elif effect.name in alternatives:
+                reason = "explains the record as well as the effect that was named: an alternative"
+            elif candidate is None:
+                reason = "this record cannot show it, or the baseline holds it"
+            elif candidate.refused:
+                reason = candidate.refused
+            elif chosen and effect.name in rivals:
+                reason = f"leaves {100.0 * np.expm1(rivals[effect.name]):.3g} % more than the effects that were named"
+            else:
+                reason = f"explains too little (gain below {ENOUGH:g})"
+            out.append(
+                Tested(effect.name, effect.code, None if candidate is None else candidate.gain, reason)
+            )
+        return tuple(out)
+
+    def _notes(self) -> tuple[str, ...]:
+        problem = self.final.problem
+        notes = [f"compared up to {problem.band_hz:.3g} Hz, where the encoders resolve the motion"]
+        if len(self.fitter.holds) > 1:
+            how = "held from its stamp for one sample" if problem.hold else "measured at its stamp"
+            notes.append(
+                f"the torque fits best as {how}; signals.{self.config.signals.torque_role}.hold declares it"
+            )
+        return tuple(notes)
+
+
+def _variable(equation: str, maps: list[Map]) -> str:
+    return next((m.variable for m in maps if m.equation == equation), "velocity")

@@ -1,0 +1,106 @@
+"""How sure a named effect is: score, stability over the record, and data that it was not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexid_cli.diagnose.basis import solve
+from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter
+from flexid_cli.diagnose.problem import Problem
+
+Array = NDArray[np.float64]
+
+BLOCKS = 24  # of the score test: long against the residual's correlation, many enough for Student's t
+FOLDS = 5  # of the record, each predicted from the others
+STABILITY_BLOCKS = 6
+
+
+@dataclass(frozen=True)
+class Score:
+    """Score test of one effect, and how steady its amplitude is."""
+
+    p_value: float
+    stability: float
+
+
+def score(fitter: Fitter, fitted: Fitted, k: int, library: int) -> Score:
+    """Score test of the k-th effect against the model without it.
+
+    The score's sum over the record is compared with its own spread between blocks, so that coloured residuals do
+    not make it look sure; Bonferroni's correction over the ``library`` that was searched.
+    """
+    from scipy.stats import t as student
+
+    chosen = fitted.chosen[k]
+    rest = fitter.fit(fitted.problem, (*fitted.chosen[:k], *fitted.chosen[k + 1 :]), fitted.search)
+    rows = fitted.search.rows(chosen.form, chosen.shape)
+    column = rest.basis.outside(rows) @ np.atleast_1d(fitted.amplitudes(k))[: rows.shape[1]]
+    parts = _blocks(column * rest.basis.residual, fitted.problem, BLOCKS)
+    spread = float(np.std(parts, ddof=1)) * np.sqrt(parts.size)
+    statistic = float(parts.sum()) / max(spread, 1e-300)
+    p = 2.0 * float(student.sf(abs(statistic), parts.size - 1))
+    few = _blocks(column * rest.basis.residual, fitted.problem, STABILITY_BLOCKS)
+    weight = _blocks(column**2, fitted.problem, STABILITY_BLOCKS)
+    informed = weight > 0.02 * weight.max()
+    return Score(min(1.0, p * library), float(np.mean(few[informed] > 0.0)))
+
+
+def _blocks(values: Array, problem: Problem, count: int) -> Array:
+    """Sums over blocks of time of row values, equations added."""
+    by_time = values.reshape(problem.equations, -1).sum(axis=0)
+    return np.array([part.sum() for part in np.array_split(by_time, count)])
+
+
+def cross_validated(fitter: Fitter, before: Fitted, after: Fitted) -> tuple[Array, Array]:
+    """Residual rows of both models, each fifth of the record predicted from the rest (with a gap between)."""
+    out = []
+    for fitted in (before, after):
+        rows = fitted.y.size // fitted.problem.equations
+        fold = np.minimum(np.arange(rows) * FOLDS // rows, FOLDS - 1)
+        gap = max(2, rows // 200)
+        columns = fitted.basis.columns
+        residual = np.empty_like(fitted.y)
+        for f in range(FOLDS):
+            inside = fold == f
+            first, last = np.flatnonzero(inside)[[0, -1]]
+            near = (np.arange(rows) >= first - gap) & (np.arange(rows) <= last + gap)
+            train, test = np.tile(~near, fitted.problem.equations), np.tile(inside, fitted.problem.equations)
+            coefficients = solve(columns[train], fitted.y[train]).coefficients
+            residual[test] = fitted.y[test] - columns[test] @ coefficients
+        out.append(residual)
+    return out[0], out[1]
+
+
+def predicted(problem: Problem, fitter: Fitter, fitted: Fitted) -> Array:
+    """Residual rows of another record with all parameters of ``fitted``; both share one linearisation's names."""
+    there = fitter.fit(problem.at(fitted.problem.base, hold=fitted.problem.hold), fitted.chosen)
+    coefficients = fitted.basis.coefficients
+    if problem.both:
+        return np.asarray(there.y - there.basis.columns @ coefficients)
+    # The motor alone: the target is the misfit at the parameters already; only the effects are added.
+    steps = coefficients.copy()
+    return np.asarray(there.y - there.basis.columns @ steps)
+
+
+def held_out_gain(before: Array, after: Array) -> float:
+    """Logarithm of the sums of squares, before over after."""
+    return float(np.log(float(before @ before) / max(float(after @ after), 1e-300)))
+
+
+def by_equation(problem: Problem, residual: Array) -> Mapping[str, Array]:
+    """Rows of each equation."""
+    names = ("motor", "load") if problem.both else ("motor",)
+    return dict(zip(names, residual.reshape(problem.equations, -1), strict=True))
+
+
+def gains(fitter: Fitter, fitted: Fitted) -> list[float]:
+    """What leaving out each effect costs, at the present linearisation."""
+    out = []
+    for k in range(len(fitted.chosen)):
+        rest: tuple[Chosen, ...] = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
+        out.append(float(np.log(fitter.fit(fitted.problem, rest, fitted.search).cost / fitted.cost)))
+    return out

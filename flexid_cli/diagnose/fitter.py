@@ -1,0 +1,185 @@
+"""Fits the baseline with any set of effects to one record, and moves the linearisation until it settles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexid_cli.diagnose.basis import Basis, solve
+from flexid_cli.diagnose.problem import Problem
+from flexid_cli.diagnose.search import Candidate, Form, Search, golden
+from flexid_cli.effects.motion import Base
+
+Array = NDArray[np.float64]
+
+SETTLED = 1e-3  # change of the cost's logarithm
+WIDTH_STEPS = 6
+WIDTH_RANGE = 1.2  # of the logarithm of a reversal width, around the present one
+NARROWEST = 1e-5  # reversal width, rad/s or m/s
+THREADS = 2
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A form of an effect with its shape, in the model."""
+
+    form: Form
+    shape: tuple[float, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.form.name
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Baseline and chosen effects fitted together in one linearisation."""
+
+    problem: Problem
+    search: Search
+    chosen: tuple[Chosen, ...]
+    basis: Basis
+    y: Array
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares that is left."""
+        return self.basis.cost
+
+    def amplitudes(self, k: int) -> Array:
+        """Amplitudes of the k-th chosen effect."""
+        chosen = self.chosen[k]
+        if chosen.form.signature.fixed is not None:
+            return np.array([chosen.form.signature.fixed])
+        return self.basis.coefficients[self._columns(k)]
+
+    def amplitude_errors(self, k: int) -> Array:
+        """Their standard errors for independent rows."""
+        if self.chosen[k].form.signature.fixed is not None:
+            return np.zeros(1)
+        return self.basis.rms * np.sqrt(np.diag(self.basis.covariance)[self._columns(k)])
+
+    def _columns(self, k: int) -> slice:
+        first = len(self.problem.names)
+        for c in self.chosen[:k]:
+            first += 0 if c.form.signature.fixed is not None else self.search.rows(c.form, c.shape).shape[1]
+        return slice(first, first + self.search.rows(self.chosen[k].form, self.chosen[k].shape).shape[1])
+
+
+class Fitter:
+    """Fits of one record.
+
+    Parameters
+    ----------
+    forms : sequence of Form
+        Effects that may be tried.
+    holds : tuple of bool
+        Whether the torque may be measured at its stamp (False), held for a period (True), or either.
+    """
+
+    def __init__(self, forms: Sequence[Form], holds: tuple[bool, ...]) -> None:
+        self.forms, self.holds = tuple(forms), holds
+
+    def fit(self, problem: Problem, chosen: Sequence[Chosen] = (), search: Search | None = None) -> Fitted:
+        """Linear fit at the given shapes."""
+        search = search or Search(problem, self.forms)
+        y, columns = search.target, [search.base]
+        for c in chosen:
+            rows = search.rows(c.form, c.shape)
+            if c.form.signature.fixed is not None:
+                y = y - rows[:, 0] * c.form.signature.fixed
+            else:
+                columns.append(rows)
+        return Fitted(problem, search, tuple(chosen), solve(np.hstack(columns), y), y)
+
+    def relax(self, problem: Problem, chosen: Sequence[Chosen] = (), rounds: int = 3) -> Fitted:
+        """Fit; move linearisation, reversal widths, hold and shapes; until nothing changes or ``rounds`` are over."""
+        fitted = self.fit(problem, chosen)
+        best = fitted
+        for _ in range(rounds):
+            base = self._widths(fitted, self.moved(fitted))
+            fitted = self._shapes(self.fit(problem.at(base, hold=self._hold(fitted)), fitted.chosen))
+            gained = np.log(best.cost / fitted.cost)
+            best = fitted if gained > 0.0 else best
+            if abs(gained) < SETTLED:
+                break
+        return best
+
+    @staticmethod
+    def moved(fitted: Fitted) -> Base:
+        """The baseline that a fit gives."""
+        return fitted.problem.moved(fitted.basis.coefficients[: len(fitted.problem.names)])
+
+    def _widths(self, fitted: Fitted, base: Base) -> Base:
+        """Reversal widths by golden section; only the Coulomb column changes with them."""
+        problem = fitted.problem
+        for field, symbol in (("motor_reversal", "FSm"), ("load_reversal", "FS")):
+            k = problem.names.index(symbol)
+            # The motor alone is solved for steps: the misfit lacks the friction at the linearisation.
+            y = (
+                fitted.y
+                if problem.both
+                else fitted.y + getattr(problem.base, symbol) * fitted.search.base[:, k]
+            )
+            rest = solve(np.delete(fitted.basis.columns, k, axis=1), y)
+
+            def cost(u: float, field: str = field, rest: Basis = rest) -> float:
+                c = rest.outside(problem.sign_rows(field, float(np.exp(u))))
+                size = float(c @ c)
+                return rest.cost - (float(c @ rest.residual) ** 2 / size if size > 0.0 else 0.0)
+
+            now = float(np.log(getattr(problem.base, field)))
+            best = golden(cost, max(now - WIDTH_RANGE, np.log(NARROWEST)), now + WIDTH_RANGE, WIDTH_STEPS)
+            if cost(best) < cost(now):
+                base = replace(base, **{field: float(np.exp(best))})
+        return base
+
+    def _hold(self, fitted: Fitted) -> bool:
+        if len(self.holds) == 1:
+            return self.holds[0]
+
+        def cost(hold: bool) -> float:
+            e = fitted.basis.outside(fitted.y + fitted.problem.target(hold=hold) - fitted.search.target)
+            return float(e @ e)
+
+        return min(self.holds, key=cost)
+
+    def _shapes(self, fitted: Fitted) -> Fitted:
+        """Refine the shapes of all effects, one after the other, given the rest."""
+        for k, c in enumerate(fitted.chosen):
+            if not fitted.search.shapes(c.form):
+                continue
+            rest = self.fit(fitted.problem, _without(fitted.chosen, k), fitted.search)
+            best = fitted.search.refine(fitted.search.evaluate(c.form, c.shape, rest.basis), rest.basis)
+            chosen = (*fitted.chosen[:k], Chosen(c.form, best.shape), *fitted.chosen[k + 1 :])
+            fitted = self.fit(fitted.problem, chosen, fitted.search)
+        return fitted
+
+    def candidates(self, fitted: Fitted, without: int | None = None) -> list[Candidate]:
+        """The best form of every effect that is not in the model, best first, refused ones last.
+
+        ``without`` takes one of the model's effects out before: what could stand in its place (itself included).
+        """
+        now = (
+            fitted
+            if without is None
+            else self.fit(fitted.problem, _without(fitted.chosen, without), fitted.search)
+        )
+        taken = {c.name for c in now.chosen}
+        forms = [f for f in self.forms if f.name not in taken]
+        with ThreadPoolExecutor(THREADS) as pool:
+            found = [c for c in pool.map(lambda f: fitted.search.best(f, now.basis), forms) if c is not None]
+        by_name: dict[str, Candidate] = {}
+        for c in found:
+            if c.form.name not in by_name or c.rank < by_name[c.form.name].rank:
+                by_name[c.form.name] = c
+        return sorted(by_name.values(), key=lambda c: c.rank)
+
+
+def _without(chosen: Sequence[Chosen], k: int) -> tuple[Chosen, ...]:
+    return (*chosen[:k], *chosen[k + 1 :])

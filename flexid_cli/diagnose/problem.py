@@ -1,0 +1,407 @@
+"""The baseline and the columns of effects in whitened rows: what the search for effects works on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexid_cli.diagnose.rows import Complex, Taper, Weights, motor_only_noise, two_encoder_noise
+from flexid_cli.effects.motion import Base, Motion, Terms
+from flexid_cli.effects.signature import Scale
+from flexid_cli.estimate.budget import NoiseLevels
+from flexid_cli.pipeline import filters
+from flexid_cli.pipeline.columns import reversal
+from flexid_cli.pipeline.derivatives import differentiate
+from flexid_cli.signals.recording import Segment
+
+Array = NDArray[np.float64]
+Part = Callable[["Stretch", Motion], Sequence["Complex | None"]]
+
+HALF_WIDTH = 12  # of the derivatives: exact to 1e-6 up to a third of the sampling rate
+MARGIN = 4 * HALF_WIDTH  # samples at the ends that derivatives of derivatives cannot reach
+# Bands over that of the rows: of the motion that columns are made of, and of the velocities whose sign is taken. A
+# reversal is sharper than any band; the joint's encoder sees more noise and a load that reverses more softly.
+SMOOTH_BAND, MOTOR_SIGN_BAND, JOINT_SIGN_BAND = 1.5, 4.0, 2.0
+HIGHEST_CUTOFF = 0.44  # of the sampling rate; above it nothing is cut
+SHORTEST_S = 2.0
+# Torque that no model of a drive predicts, as a share of the torque's RMS: timing, rounding, the finite filters.
+# See docs/diagnosis.md for the calibration.
+MODEL_FLOOR = 0.001
+BOTH_NAMES = ("Jm", "FVm", "FSm", "K", "c", "JL", "FV", "FS", "MX", "MY")
+ALONE_NAMES = ("Jm", "FVm", "FSm", "K", "JL", "FV", "FS")
+
+
+class Stretch:
+    """One gap-free segment: its signals and their smoothed motion.
+
+    Parameters
+    ----------
+    segment : Segment
+    rate_hz, band_hz : float
+        Sampling rate, and band of the rows.
+    """
+
+    def __init__(self, segment: Segment, rate_hz: float, band_hz: float) -> None:
+        self.rate_hz, self.period_s, self._band = rate_hz, 1.0 / rate_hz, band_hz
+        self.torque, self.motor, self.joint = segment.torque, segment.motor_position, segment.joint_position
+        self.start_s = segment.start_s
+        self.time_s = segment.start_s + np.arange(segment.samples) * self.period_s
+        self.taper = Taper.of(segment.samples, rate_hz, band_hz, MARGIN)
+        self.motor_smooth = self.lowpass(self.motor, SMOOTH_BAND)
+        self.motor_velocity = self.derivative(self.motor_smooth, 1)
+        self.motor_sharp = self.derivative(self.lowpass(self.motor, MOTOR_SIGN_BAND), 1)
+        if self.joint is not None:
+            self.joint_smooth = self.lowpass(self.joint, SMOOTH_BAND)
+            self.joint_sharp = self.derivative(self.lowpass(self.joint, JOINT_SIGN_BAND), 1)
+
+    def lowpass(self, x: Array, over_band: float) -> Array:
+        """Zero-phase low pass at a multiple of the rows' band."""
+        cutoff = over_band * self._band
+        if cutoff >= HIGHEST_CUTOFF * self.rate_hz:
+            return x
+        return filters.zero_phase(x, filters.butterworth(4, cutoff, self.rate_hz))
+
+    def derivative(self, x: Array, order: int) -> Array:
+        """Derivative of a signal (n,) or of columns (n, k)."""
+        if x.ndim == 2:
+            return np.column_stack([self.derivative(c, order) for c in x.T])
+        y = differentiate(x, order, self.period_s, half_width=HALF_WIDTH)
+        # The ends cannot be differentiated; a spike there would ring through the effects' filters.
+        reach = HALF_WIDTH * ((order + 1) // 2)
+        y[:reach], y[-reach:] = y[reach], y[-reach - 1]
+        return y
+
+    def spectrum(self, x: Array) -> Complex:
+        """Transform of a tapered signal or of columns."""
+        return self.taper.spectrum(x[:, None] if x.ndim == 1 else x)
+
+
+class Problem:
+    """Baseline columns, measurement and effect columns of one record, linearised at ``base``.
+
+    Parameters
+    ----------
+    stretches : sequence of Stretch
+    base : Base
+        Where the equations are linearised, and what their noise is shaped by.
+    noise : NoiseLevels
+        Of the signals.
+    band_hz : float
+        Highest frequency of the rows.
+    gravity, gear_ratio, duration_s : float
+    both : bool
+        Motor and load equation from both encoders, or eq. (18) from the motor's alone.
+    hold : bool
+        The torque is held from its stamp for one period.
+    """
+
+    def __init__(
+        self,
+        stretches: Sequence[Stretch],
+        base: Base,
+        noise: NoiseLevels,
+        band_hz: float,
+        *,
+        gravity: float,
+        gear_ratio: float,
+        duration_s: float,
+        both: bool,
+        hold: bool,
+    ) -> None:
+        self.stretches, self.base, self.noise, self.band_hz = stretches, base, noise, band_hz
+        self.gravity, self.gear_ratio, self.duration_s = gravity, gear_ratio, duration_s
+        self.both, self.hold = both, hold
+        self.names = BOTH_NAMES if both else ALONE_NAMES
+        self.torque_rms = float(np.sqrt(np.mean(np.concatenate([s.torque for s in stretches]) ** 2)))
+        self.weights = [Weights(s.taper, self.spectral(s)) for s in stretches]
+        self.motions = [self._motion(s) for s in stretches]
+
+    def at(self, base: Base, *, hold: bool | None = None) -> Problem:
+        """The same record linearised elsewhere."""
+        return Problem(
+            self.stretches, base, self.noise, self.band_hz, gravity=self.gravity, gear_ratio=self.gear_ratio,
+            duration_s=self.duration_s, both=self.both, hold=self.hold if hold is None else hold,
+        )  # fmt: skip
+
+    @property
+    def row_times(self) -> Array:
+        """Time of each row, s."""
+        parts = [s.start_s + w.seconds for s, w in zip(self.stretches, self.weights, strict=True)]
+        return np.concatenate(parts)
+
+    @property
+    def equations(self) -> int:
+        """Number of equations: rows of `Rows` come equation by equation."""
+        return 2 if self.both else 1
+
+    def spectral(self, stretch: Stretch) -> Complex:
+        omega = 2.0 * np.pi * stretch.taper.frequency_hz
+        floor = (MODEL_FLOOR * self.torque_rms) ** 2 * 0.5 * stretch.rate_hz / self.band_hz
+        if self.both:
+            return two_encoder_noise(self.base, self.noise, omega) + floor * np.eye(2)
+        # What the model lacks at the motor passes 1 + X2 s + X1 s^2 as the torque itself does.
+        passed = np.abs(1.0 + (self.base.FV * 1j * omega - self.base.JL * omega**2) / self.base.K) ** 2
+        return motor_only_noise(self.base, self.noise, omega) + floor * (1.0 + passed)[:, None, None]
+
+    def _motion(self, s: Stretch) -> Motion:
+        base = self.base
+        motor_sign = reversal(s.motor_sharp, base.motor_reversal)
+        if self.both:
+            joint, sharp = s.joint_smooth, s.joint_sharp
+        else:
+            friction = base.FVm * s.motor_velocity + base.FSm * s.lowpass(motor_sign, SMOOTH_BAND)
+            inertial = base.Jm * s.derivative(s.motor_smooth, 2)
+            joint = s.motor_smooth - (s.lowpass(s.torque, SMOOTH_BAND) - inertial - friction) / base.K
+            joint = s.lowpass(joint, SMOOTH_BAND)
+            sharp = s.derivative(joint, 1)
+        velocity = s.derivative(joint, 1)
+        return Motion(
+            time_s=s.time_s,
+            torque=s.torque,
+            motor_position=s.motor_smooth,
+            motor_velocity=s.motor_velocity,
+            joint_position=joint,
+            joint_velocity=velocity,
+            joint_acceleration=s.derivative(joint, 2),
+            motor_sign=motor_sign,
+            joint_sign=reversal(sharp, base.load_reversal),
+            deflection=s.motor_smooth - joint - base.torsion_zero,
+            deflection_rate=s.motor_velocity - velocity,
+            period_s=s.period_s,
+            base=base,
+            gravity=self.gravity,
+            gear_ratio=self.gear_ratio,
+            joint_encoder=self.both,
+            duration_s=self.duration_s,
+        )
+
+    def _rows(self, part: Part) -> Array:
+        """Rows of all stretches, equation by equation, shape (equations * rows, k)."""
+        parts = [
+            w.apply(part(s, m)) for s, m, w in zip(self.stretches, self.motions, self.weights, strict=True)
+        ]
+        stacked = np.concatenate(parts, axis=1)
+        return stacked.reshape(-1, stacked.shape[-1])
+
+    def through(self, s: Stretch, x: Array) -> Array:
+        """1 + X2 d/dt + X1 d2/dt2 of a motor-side torque: how it stands in eq. (18)."""
+        return (
+            x
+            + self.base.FV / self.base.K * s.derivative(x, 1)
+            + self.base.JL / self.base.K * s.derivative(x, 2)
+        )
+
+    def _one(self, spectrum: Complex, equation: str) -> list[Complex | None]:
+        if not self.both:
+            return [spectrum]
+        return [spectrum, None] if equation == "motor" else [None, spectrum]
+
+    def target(self, *, hold: bool | None = None) -> Array:
+        """What the columns are to explain, shape (r,).
+
+        Both encoders: the torque. Motor alone: the misfit of eq. (18) at the linearisation.
+        """
+        held = self.hold if hold is None else hold
+
+        def part(s: Stretch, m: Motion) -> list[Complex | None]:
+            torque = s.torque if self.both else self.through(s, s.torque)
+            spectrum = _held(s, s.spectrum(torque)) if held else s.spectrum(torque)
+            if self.both:
+                return [spectrum, None]
+            b = self.base
+            acceleration, velocity = s.derivative(s.motor, 2), s.derivative(s.motor, 1)
+            motor = b.Jm * acceleration + b.FVm * velocity + b.FSm * m.motor_sign
+            load = b.JL * acceleration + b.FV * velocity + b.FS * m.joint_sign
+            return [spectrum - s.spectrum(self.through(s, motor) + load)]
+
+        return self._rows(part)[:, 0]
+
+    def base_rows(self) -> Array:
+        """Rows of the baseline's columns, in the order of ``names``."""
+        return self._rows(self._base_both if self.both else self._base_alone)
+
+    def _base_both(self, s: Stretch, m: Motion) -> list[Complex | None]:
+        one = np.ones(s.torque.size)
+        torsion = s.motor - s.joint
+        motor = [s.derivative(s.motor, 2), s.derivative(s.motor, 1), m.motor_sign, torsion, one]
+        load = [-torsion, -one, s.derivative(s.joint, 2), s.derivative(s.joint, 1), m.joint_sign]
+        load += [self.gravity * np.cos(m.joint_position), self.gravity * np.sin(m.joint_position)]
+        M, L = s.spectrum(np.column_stack(motor)), s.spectrum(np.column_stack(load))
+        return [np.hstack([M, np.zeros((M.shape[0], 5))]), np.hstack([np.zeros((M.shape[0], 3)), L])]
+
+    def _base_alone(self, s: Stretch, m: Motion) -> list[Complex | None]:
+        b = self.base
+        acceleration, velocity = s.derivative(s.motor, 2), s.derivative(s.motor, 1)
+        passed = s.torque - b.Jm * acceleration - b.FVm * velocity - b.FSm * m.motor_sign
+        first, second = s.derivative(passed, 1), s.derivative(passed, 2)
+        columns = [
+            self.through(s, acceleration),
+            self.through(s, velocity),
+            self.through(s, m.motor_sign),
+            (b.JL * second + b.FV * first) / b.K**2,
+            acceleration - second / b.K,
+            velocity - first / b.K,
+            m.joint_sign,
+        ]
+        return [s.spectrum(np.column_stack(columns))]
+
+    def sign_rows(self, field: str, width: float) -> Array:
+        """Rows of one Coulomb column for another reversal width, shape (r,)."""
+
+        def part(s: Stretch, m: Motion) -> list[Complex | None]:
+            if field == "motor_reversal":
+                sign = reversal(s.motor_sharp, width)
+                return self._one(s.spectrum(sign if self.both else self.through(s, sign)), "motor")
+            sharp = s.joint_sharp if self.both else m.joint_velocity
+            return self._one(s.spectrum(reversal(sharp, width)), "load")
+
+        return self._rows(part)[:, 0]
+
+    def noise_rows(self, noisy: Sequence[Stretch]) -> tuple[Array, Array]:
+        """Baseline columns and target of stretches of pure noise, weighted as this record's (both encoders).
+
+        Signs, gravity and constants are not linear in the noise and stay zero.
+        """
+
+        def part(s: Stretch) -> list[Complex | None]:
+            zero = np.zeros(s.torque.size)
+            torsion = s.motor - s.joint
+            motor = [s.derivative(s.motor, 2), s.derivative(s.motor, 1), zero, torsion, zero]
+            load = [-torsion, zero, s.derivative(s.joint, 2), s.derivative(s.joint, 1), zero, zero, zero]
+            M, L = s.spectrum(np.column_stack(motor)), s.spectrum(np.column_stack(load))
+            return [np.hstack([M, np.zeros((M.shape[0], 5))]), np.hstack([np.zeros((M.shape[0], 3)), L])]
+
+        parts = [w.apply(part(s)) for s, w in zip(noisy, self.weights, strict=True)]
+        stacked = np.concatenate(parts, axis=1)
+        columns = stacked.reshape(-1, stacked.shape[-1])
+        return columns, np.zeros(columns.shape[0])
+
+    def effect_rows(self, terms_of: Callable[[Motion], Terms]) -> Array:
+        """Rows of what an effect adds, shape (r, k)."""
+        place = self._place_both if self.both else self._place_alone
+        return self._rows(lambda s, m: place(s, terms_of(m)))
+
+    def _place_both(self, s: Stretch, t: Terms) -> list[Complex | None]:
+        b = self.base
+        motor, load = t.motor, t.load
+        if t.transmission is not None:
+            motor, load = _plus(motor, t.transmission), _plus(load, -t.transmission)
+        if t.joint_error is not None:
+            e = t.joint_error
+            motor = _plus(motor, b.K * e)
+            load = _plus(load, -(b.JL * s.derivative(e, 2) + b.FV * s.derivative(e, 1) + b.K * e))
+        if t.motor_error is not None:
+            e = t.motor_error
+            motor = _plus(motor, -(b.Jm * s.derivative(e, 2) + b.FVm * s.derivative(e, 1) + b.K * e))
+            load = _plus(load, b.K * e)
+        return [None if x is None else s.spectrum(x) for x in (motor, load)]
+
+    def _place_alone(self, s: Stretch, t: Terms) -> list[Complex | None]:
+        b = self.base
+        total = t.load
+        if t.motor is not None:
+            total = _plus(total, self.through(s, t.motor))
+        if t.transmission is not None:
+            total = _plus(total, self.through(s, t.transmission) - t.transmission)
+        if t.motor_error is not None:
+            e = t.motor_error
+            motor = b.Jm * s.derivative(e, 2) + b.FVm * s.derivative(e, 1)
+            load = b.JL * s.derivative(e, 2) + b.FV * s.derivative(e, 1)
+            total = _plus(total, -self.through(s, motor) - load)
+        return [None if total is None else s.spectrum(total)]
+
+    def back(self, rows: Array, equation: str) -> list[Array]:
+        """Transpose of `effect_rows` for a column of one equation: one array (n,) a stretch."""
+        blocks = rows.reshape(self.equations, -1)
+        out, first = [], 0
+        for s, w in zip(self.stretches, self.weights, strict=True):
+            size = int(w.open.sum())
+            g = w.back(blocks[:, first : first + size])
+            first += size
+            if self.both:
+                out.append(
+                    g[0] if equation == "motor" else g[0] - g[1] if equation == "transmission" else g[1]
+                )
+                continue
+            # The transpose of a derivative is its negative, of a second one itself.
+            passed = self.base.JL / self.base.K * s.derivative(
+                g[0], 2
+            ) - self.base.FV / self.base.K * s.derivative(g[0], 1)
+            out.append({"motor": g[0] + passed, "transmission": passed, "load": g[0]}[equation])
+        return out
+
+    def scale(self) -> Scale:
+        """Sizes of the record from which ranges of shapes follow."""
+        b, rate = self.base, self.stretches[0].rate_hz
+        narrow = np.sqrt(min(1.0, 2.0 * SMOOTH_BAND * self.band_hz / rate))
+
+        def all_of(name: str) -> Array:
+            return np.abs(np.concatenate([getattr(m, name) for m in self.motions]))
+
+        def travel(name: str) -> float:
+            return float(np.ptp(np.concatenate([getattr(m, name) for m in self.motions])))
+
+        return Scale(
+            duration_s=self.duration_s,
+            period_s=1.0 / rate,
+            band_hz=self.band_hz,
+            motor_speed=float(np.quantile(all_of("motor_velocity"), 0.98)),
+            joint_speed=float(np.quantile(all_of("joint_velocity"), 0.98)),
+            motor_reversal_step=_reversal_step(
+                [s.motor_sharp for s in self.stretches], rate, MOTOR_SIGN_BAND * self.band_hz
+            ),
+            joint_reversal_step=_reversal_step(
+                [
+                    s.joint_sharp if self.both else m.joint_velocity
+                    for s, m in zip(self.stretches, self.motions, strict=True)
+                ],
+                rate,
+                (JOINT_SIGN_BAND if self.both else SMOOTH_BAND) * self.band_hz,
+            ),
+            motor_range=travel("motor_position"),
+            joint_range=travel("joint_position"),
+            deflection=float(np.quantile(all_of("deflection"), 0.99)),
+            deflection_noise=float(np.hypot(self.noise.motor_position, self.noise.joint_position) * narrow),
+            torque=float(np.max(all_of("torque"))),
+            resonance_hz=float(np.sqrt(b.K * (1.0 / b.Jm + 1.0 / b.JL)) / (2.0 * np.pi)),
+            gear_ratio=self.gear_ratio,
+            joint_encoder=self.both,
+            base=b,
+        )
+
+    def moved(self, coefficients: Array) -> Base:
+        """The baseline that a solution for the base columns gives.
+
+        The motor alone is solved for steps, which are kept short: the equation is linear only nearby.
+        """
+        v = dict(zip(self.names, (float(x) for x in coefficients), strict=True))
+        b = self.base
+        if self.both:
+            new = {n: v[n] for n in ("FVm", "FSm", "FV", "FS")}
+            strong = {n: v[n] if v[n] > 0.05 * getattr(b, n) else getattr(b, n) for n in ("Jm", "K", "JL")}
+            return replace(b, **new, **strong, torsion_zero=-v["c"] / strong["K"])
+        strong = {
+            n: getattr(b, n) * float(np.clip(1.0 + v[n] / getattr(b, n), 0.7, 1.4)) for n in ("Jm", "K", "JL")
+        }
+        return replace(b, **{n: getattr(b, n) + v[n] for n in ("FVm", "FSm", "FV", "FS")}, **strong)
+
+
+def _reversal_step(velocities: Sequence[Array], rate_hz: float, cutoff_hz: float) -> float:
+    """Median change of a velocity about its reversals within the reach of a low pass, 1 / (2 pi cutoff)."""
+    slopes = [np.abs(np.diff(v))[np.sign(v[1:]) != np.sign(v[:-1])] for v in velocities]
+    found = np.concatenate(slopes) * rate_hz
+    reach = 1.0 / (2.0 * np.pi * min(cutoff_hz, HIGHEST_CUTOFF * rate_hz))
+    return float(np.median(found) * reach) if found.size else 0.0
+
+
+def _held(s: Stretch, spectrum: Complex) -> Complex:
+    """A torque that acts as steps from its stamps on: half a period late, damped by a sinc."""
+    f = s.taper.frequency_hz[:, None]
+    return spectrum * np.exp(-1j * np.pi * f * s.period_s) * np.sinc(f * s.period_s)
+
+
+def _plus(a: Array | None, b: Array) -> Array:
+    return b if a is None else a + b

@@ -1,0 +1,221 @@
+"""One effect against the residual of what is in the model already: its shape is searched, not gridded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexid_cli.diagnose.basis import Basis
+from flexid_cli.diagnose.problem import Problem
+from flexid_cli.effects.base import Effect
+from flexid_cli.effects.motion import Shape
+from flexid_cli.effects.signature import Scale, Signature
+
+Array = NDArray[np.float64]
+
+GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+GOLDEN_STEPS = 7
+PEAKS = 5  # of a search over cycles that are looked at exactly
+NORMS = 16  # cycles at which a ripple's size in the rows is worked out
+DEPENDENT = 1e-7  # a column with less than this share outside the model's is the model's
+CACHED = 4000
+
+
+@dataclass(frozen=True)
+class Form:
+    """One form of an effect, by which it enters the model."""
+
+    effect: Effect
+    index: int
+
+    @property
+    def signature(self) -> Signature:
+        """Its columns and shapes."""
+        return self.effect.signatures[self.index]
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.effect.name
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A form of an effect with its best shape, against the residual of a model.
+
+    Attributes
+    ----------
+    amplitudes : ndarray, shape (k,)
+    before, cost : float
+        Sum of squares of the residual without it and with it.
+    refused : str
+        Why it cannot be the effect although it may fit.
+    """
+
+    form: Form
+    shape: tuple[float, ...]
+    amplitudes: Array
+    before: float
+    cost: float
+    refused: str = ""
+
+    @property
+    def gain(self) -> float:
+        """Logarithm of the cost before over after."""
+        return float(np.log(self.before / max(self.cost, 1e-300)))
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Order of candidates: possible ones first, then by what they leave."""
+        return bool(self.refused), self.cost
+
+
+class Search:
+    """Searches in one linearisation; columns that were made once are kept.
+
+    Parameters
+    ----------
+    problem : Problem
+    forms : sequence of Form
+        That this record could show.
+    """
+
+    def __init__(self, problem: Problem, forms: Sequence[Form]) -> None:
+        self.problem, self.forms = problem, forms
+        self.scale: Scale = problem.scale()
+        self.target = problem.target()
+        self.base = problem.base_rows()
+        self._rows: dict[tuple[Form, tuple[float, ...]], Array] = {}
+        self._norms: dict[str, tuple[Array, Array]] = {}
+
+    def rows(self, form: Form, shape: tuple[float, ...]) -> Array:
+        """Whitened columns of a form for unit amplitudes."""
+        key = (form, shape)
+        if key not in self._rows:
+            if len(self._rows) > CACHED:
+                self._rows.clear()
+            self._rows[key] = self.problem.effect_rows(lambda m: form.signature.columns(m, shape))
+        return self._rows[key]
+
+    def shapes(self, form: Form) -> Sequence[Shape] | None:
+        """Shape parameters with their ranges; None where the record cannot show the form."""
+        shapes = form.signature.shapes(self.scale)
+        if shapes is None or any(not 0.0 < s.high - s.low < np.inf for s in shapes):
+            return None
+        return shapes
+
+    def evaluate(self, form: Form, shape: tuple[float, ...], now: Basis) -> Candidate:
+        """Fit a form's amplitudes, or take the fixed one, at one shape."""
+        C = self.rows(form, shape)
+        before, signature = now.cost, form.signature
+        if signature.fixed is not None:
+            e = now.residual - now.outside(C[:, 0] * signature.fixed)
+            return Candidate(form, shape, np.array([signature.fixed]), before, float(e @ e))
+        P = now.outside(C)
+        norm = np.linalg.norm(P, axis=0)
+        if not np.all(norm > DEPENDENT * np.linalg.norm(C, axis=0)):
+            return Candidate(
+                form, shape, np.zeros(C.shape[1]), before, before, "its columns depend on the model's"
+            )
+        q, r = np.linalg.qr(P / norm)
+        z = q.T @ now.residual
+        amplitudes = np.linalg.lstsq(r, z, rcond=None)[0] / norm
+        cost = max(before - float(z @ z), 0.0)
+        if signature.sign * amplitudes[0] < 0.0:
+            return Candidate(
+                form, shape, amplitudes, before, before, "physics forbids the sign that the fit gives it"
+            )
+        refused = "" if signature.tied is None else signature.tied(amplitudes, shape, self.problem.base)
+        return Candidate(form, shape, amplitudes, before, cost, refused)
+
+    def best(self, form: Form, now: Basis) -> Candidate | None:
+        """Search a form's shape; None where the record cannot show it."""
+        shapes = self.shapes(form)
+        if shapes is None:
+            return None
+        points = self._ripples(form, shapes[0], now) if form.signature.ripple else _grid(shapes)
+        best = min((self.evaluate(form, p, now) for p in points), key=lambda c: c.rank)
+        return best if not shapes or best.refused else self.refine(best, now)
+
+    def _ripples(self, form: Form, shape: Shape, now: Basis) -> list[tuple[float, ...]]:
+        """Cycles at which a ripple over the motor's angle would explain most, by one transform over all of them."""
+        cycles = shape.grid()
+        step = cycles[1] - cycles[0]
+        score = np.zeros(cycles.size, dtype=np.complex128)
+        weights = self.problem.back(now.residual, form.signature.ripple)
+        for g, m in zip(weights, self.problem.motions, strict=True):
+            turning = g * np.exp(1j * cycles[0] * m.motor_position)
+            advance = np.exp(1j * step * m.motor_position)
+            for k in range(cycles.size):
+                score[k] += turning.sum()
+                turning *= advance
+        explained = np.abs(score) ** 2 / self._ripple_norm(form, cycles)
+        peak = np.r_[True, explained[1:] > explained[:-1]] & np.r_[explained[:-1] >= explained[1:], True]
+        order = np.argsort(np.where(peak, explained, -1.0))[::-1][:PEAKS]
+        return [(float(cycles[k]),) for k in order]
+
+    def _ripple_norm(self, form: Form, cycles: Array) -> Array:
+        """Mean square of a ripple's rows, worked out at a few cycles: it changes slowly with them."""
+        if form.name not in self._norms:
+            some = np.linspace(cycles[0], cycles[-1], NORMS)
+            norms = [float(np.mean(np.sum(self.rows(form, (float(n),)) ** 2, axis=0))) for n in some]
+            self._norms[form.name] = some, np.asarray(norms)
+        return np.maximum(np.interp(cycles, *self._norms[form.name]), 1e-300)
+
+    def refine(self, best: Candidate, now: Basis) -> Candidate:
+        """Golden section along each shape parameter in turn, between the neighbours of the best point."""
+        shapes = self.shapes(best.form)
+        if not shapes:
+            return best
+        steps = [_step(s) for s in shapes]
+        for _ in range(2 if len(shapes) > 1 else 1):
+            for k, s in enumerate(shapes):
+                best = self._along(best, k, s, steps[k], now)
+                steps[k] *= 0.3
+        return best
+
+    def _along(self, best: Candidate, k: int, s: Shape, step: float, now: Basis) -> Candidate:
+        to, back = (np.log, np.exp) if s.spacing == "log" else (float, float)
+        centre = float(to(best.shape[k]))
+        low, high = max(centre - step, float(to(s.low))), min(centre + step, float(to(s.high)))
+        found = [best]
+
+        def cost(u: float) -> float:
+            shape = (*best.shape[:k], float(back(u)), *best.shape[k + 1 :])
+            found.append(self.evaluate(best.form, shape, now))
+            return found[-1].cost
+
+        golden(cost, low, high, GOLDEN_STEPS)
+        return min(found, key=lambda c: c.rank)
+
+
+def golden(cost: object, low: float, high: float, steps: int) -> float:
+    """Minimum of a function of one variable by golden section; the best point that was tried."""
+    c, d = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    fc, fd = cost(c), cost(d)  # type: ignore[operator]
+    for _ in range(steps):
+        if fc < fd:
+            high, d, fd = d, c, fc
+            c = high - GOLDEN * (high - low)
+            fc = cost(c)  # type: ignore[operator]
+        else:
+            low, c, fc = c, d, fd
+            d = low + GOLDEN * (high - low)
+            fd = cost(d)  # type: ignore[operator]
+    return float(c if fc < fd else d)
+
+
+def _grid(shapes: Sequence[Shape]) -> list[tuple[float, ...]]:
+    points: list[tuple[float, ...]] = [()]
+    for s in shapes:
+        values = s.grid() if s.points > 1 else np.array([0.5 * (s.low + s.high)])
+        points = [(*p, float(v)) for p in points for v in values]
+    return points
+
+
+def _step(s: Shape) -> float:
+    span = float(np.log(s.high / s.low)) if s.spacing == "log" else s.high - s.low
+    return 0.5 * span if s.points < 2 else span / (s.points - 1)

@@ -1,0 +1,109 @@
+"""Which effects a record holds: added one at a time, dropped again if a later one makes them needless."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter
+from flexid_cli.diagnose.problem import Problem
+from flexid_cli.diagnose.search import Candidate
+
+MOST_EFFECTS = 4
+RIVALS = 3
+NEAR_RIVAL = 0.5  # of the best candidate's gain
+# Least gain (logarithm of the cost) of an effect, and what an alternative may be worse by. Calibrated, see
+# docs/diagnosis.md.
+ENOUGH = 0.15
+AS_GOOD = 0.1
+LOOKED_AT = 0.6  # gain that a rival may be behind before its own refit
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Outcome of the search.
+
+    Attributes
+    ----------
+    before, after : Fitted
+        The baseline, and with the chosen effects.
+    alternatives : tuple of tuple of Fitted
+        For each chosen effect, fits of other effects in its place that the record cannot exclude.
+    tested : tuple of Candidate
+        Every effect against the baseline.
+    rivals : dict
+        Names of the other effects tried in place of each chosen one, and what they are worse by.
+    """
+
+    before: Fitted
+    after: Fitted
+    alternatives: tuple[tuple[Fitted, ...], ...]
+    tested: tuple[Candidate, ...]
+    rivals: tuple[tuple[tuple[str, float], ...], ...]
+    left: tuple[Candidate, ...]
+
+
+def select(fitter: Fitter, problem: Problem, *, enough: float = ENOUGH) -> Selection:
+    """Search the library for what the record holds beyond the baseline."""
+    before = fitter.relax(problem)
+    fitted, tested = before, fitter.candidates(before)
+    found = tested
+    while len(fitted.chosen) < MOST_EFFECTS:
+        new = _added(fitter, fitted, found)
+        if new is None or np.log(fitted.cost / new.cost) < enough:
+            break
+        fitted = _needed(fitter, new, enough)
+        found = fitter.candidates(fitted)
+    alternatives, rivals = _alternatives(fitter, fitted)
+    return Selection(before, fitted, alternatives, tuple(tested), rivals, tuple(found))
+
+
+def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted | None:
+    """The model with one more effect: of those that promise most, the one that is best after its own refit."""
+    possible = [c for c in found if not c.refused]
+    if not possible or possible[0].gain <= 0.0:
+        return None
+    rivals = [c for c in possible if c.gain > NEAR_RIVAL * possible[0].gain][:RIVALS]
+    if possible[0].gain < 0.5 * ENOUGH:
+        return None
+    trials = [
+        fitter.relax(fitter_problem(fitter, fitted), (*fitted.chosen, Chosen(c.form, c.shape)), rounds=2)
+        for c in rivals
+    ]
+    return min(trials, key=lambda f: f.cost)
+
+
+def fitter_problem(fitter: Fitter, fitted: Fitted) -> Problem:
+    """The linearisation to start a refit from."""
+    return fitted.problem
+
+
+def _needed(fitter: Fitter, fitted: Fitted, enough: float) -> Fitted:
+    """Leave out effects that the others have made needless."""
+    while len(fitted.chosen) > 1:
+        without = [
+            fitter.fit(fitted.problem, (*fitted.chosen[:k], *fitted.chosen[k + 1 :]), fitted.search)
+            for k in range(len(fitted.chosen))
+        ]
+        weakest = min(without, key=lambda f: f.cost)
+        if np.log(weakest.cost / fitted.cost) > enough:
+            break
+        fitted = fitter.relax(fitted.problem, weakest.chosen, rounds=1)
+    return fitted
+
+
+def _alternatives(
+    fitter: Fitter, fitted: Fitted
+) -> tuple[tuple[tuple[Fitted, ...], ...], tuple[tuple[tuple[str, float], ...], ...]]:
+    """What explains the record as well in place of each chosen effect."""
+    alternatives, rivals = [], []
+    for k, chosen in enumerate(fitted.chosen):
+        others = [c for c in fitter.candidates(fitted, without=k) if c.form.name != chosen.name]
+        worse = [(c.form.name, float(np.log(c.cost / fitted.cost))) for c in others]
+        near = [c for c, (_, w) in zip(others, worse, strict=True) if w < LOOKED_AT and not c.refused]
+        rest = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
+        refits = [fitter.relax(fitted.problem, (*rest, Chosen(c.form, c.shape)), rounds=2) for c in near]
+        alternatives.append(tuple(f for f in refits if np.log(f.cost / fitted.cost) < AS_GOOD))
+        rivals.append(tuple(sorted(worse, key=lambda w: w[1])))
+    return tuple(alternatives), tuple(rivals)

@@ -1,0 +1,93 @@
+"""From a selection to a verdict, in numbers and in a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from flexid_cli.diagnose.location import Map
+from flexid_cli.diagnose.result import NamedEffect, Verdict
+from flexid_cli.diagnose.selection import Selection
+
+# Calibrated, see docs/diagnosis.md: gain of a free function of one variable that nothing explains by chance, and
+# RMS of whitened rows that the finite filters leave of a complete model.
+UNEXPLAINED_GAIN = 0.25
+UNEXPLAINED_RMS = 2.5
+# A record whose torque stands less than this above its own noise cannot be judged.
+LEAST_SIGNAL = 10.0
+
+PLACES = {
+    "motor": "in the motor equation",
+    "transmission": "in the transmission",
+    "load": "in the load equation",
+    "measurement": "in the measurement",
+}
+VARIABLES = {
+    "velocity": "velocity",
+    "position": "position",
+    "position_times_sign": "position times the sign of the velocity",
+    "position_times_acceleration": "position times acceleration",
+    "position_times_torsion": "position times torsion",
+    "torsion": "torsion",
+    "load_times_sign": "load times the sign of the velocity",
+    "torque": "torque",
+    "time": "time",
+    "time_times_sign": "the friction's change with time",
+    "time_times_velocity": "the viscous friction's change with time",
+    "time_times_acceleration": "the inertia's change with time",
+    "time_times_torsion": "the stiffness's change with time",
+    "time_times_torque": "the torque's change with time",
+    "frequency": "a fixed frequency",
+}
+
+
+def is_unexplained(rms: float, maps: Sequence[Map]) -> bool:
+    """Whether a model leaves what its noise does not explain."""
+    return rms > UNEXPLAINED_RMS or (bool(maps) and maps[0].gain > UNEXPLAINED_GAIN)
+
+
+def decide(selection: Selection, unexplained: bool) -> Verdict:
+    """Verdict of a selection whose remainder is explained or not."""
+    if unexplained:
+        return "unexplained"
+    if not selection.after.chosen:
+        return "adequate"
+    return "ambiguous" if any(selection.alternatives) else "explained"
+
+
+def sentence(
+    verdict: Verdict, effects: Sequence[NamedEffect], equation: str, variable: str, share: float
+) -> str:
+    """What a person should take from it; ``share`` is what of the mismatch the effects explain."""
+    if verdict == "adequate":
+        return "The model explains the recording down to the noise of its signals: nothing is missing that it could show."
+    if verdict == "inconclusive":
+        return "The recording is too poor to judge: its torque hardly stands above its own noise."
+    if verdict == "unexplained":
+        return (
+            f"The recording holds something that no effect of the library explains; it sits {PLACES[equation]}, as a"
+            f" function of {VARIABLES[variable]}."
+        )
+    names = " and ".join(e.name.replace("_", " ") for e in effects)
+    text = f"The model left out {names}; with it {100.0 * share:.0f} % of the mismatch above the noise is explained."
+    if verdict == "ambiguous":
+        open_ones = [e for e in effects if e.alternatives]
+        others = "; ".join(f"{e.name} could also be {', '.join(e.alternatives)}" for e in open_ones)
+        text += f" The recording cannot decide everything: {others}.".replace("_", " ")
+    return text
+
+
+def advice(
+    effects: Sequence[NamedEffect], best_recordings: dict[str, str], verdict: Verdict, variable: str
+) -> tuple[str, ...]:
+    """What to record next."""
+    if verdict == "unexplained":
+        return (
+            f"Repeat the recording with another trajectory, at half the speed and at half the amplitude: what stays a"
+            f" function of {VARIABLES[variable]} is its cause's.",
+        )
+    out = []
+    for e in effects:
+        if e.alternatives:
+            names = (e.name, *e.alternatives)
+            out += [f"To tell {' from '.join(names)}: {best_recordings[name]}" for name in names]
+    return tuple(dict.fromkeys(out))
