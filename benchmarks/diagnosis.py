@@ -144,7 +144,7 @@ def labelled_configuration(facts: Mapping[str, Any], name: str) -> dict[str, Any
     torque, unit = ("motor_current", "A") if "motor_current" in facts["units"] else ("motor_torque", "N.m")
     if facts.get("torque_constant_nm_per_a") is not None:
         axis["torque_constant_nm_per_a"] = facts["torque_constant_nm_per_a"]
-    signals: dict[str, Any] = {torque: {"source": torque, "unit": unit, "hold": "sample"}}
+    signals: dict[str, Any] = {torque: {"source": torque, "unit": unit}}
     for role in ("motor_position", "reference_position", "joint_position"):
         if role in facts["units"]:
             side = "joint" if role == "joint_position" else "motor"

@@ -20,6 +20,7 @@ from flexid_cli.diagnose.selection import ENOUGH, Selection, select
 from flexid_cli.diagnose.simulation import simulation_error
 from flexid_cli.diagnose.start import first_problem
 from flexid_cli.effects.base import EffectValues
+from flexid_cli.estimate.verdict import demoted
 from flexid_cli.effects.registry import effects as library
 
 if TYPE_CHECKING:
@@ -55,8 +56,8 @@ def diagnose(
         The recording is too short, or shows no flexible axis at all.
     """
     both = recording.has_joint_position
-    fitter = Fitter(_forms(both), _holds(config))
-    problem = first_problem(recording, config.axis.gravity_m_per_s2, config.axis.gear_ratio, fitter)
+    fitter = Fitter(_forms(both), _shifts(config))
+    problem = first_problem(recording, config, fitter)
     selection = select(fitter, problem)
     return _Report(fitter, selection, recording, config, validation).diagnosis()
 
@@ -70,10 +71,13 @@ def _forms(both: bool) -> list[Form]:
     ]
 
 
-def _holds(config: Config) -> tuple[bool, ...]:
-    """Holds that may be: one that is declared has been taken into account already."""
-    torque = config.signals.torque
-    return (False,) if torque.hold is not None or torque.delay_s is not None else (False, True)
+def _shifts(config: Config) -> tuple[float, ...]:
+    """Periods by which the torque may act later than it is taken to.
+
+    Whether a drive's torque is held from its stamp is a convention that few people know of their logs: half a period
+    is never reported as physics.
+    """
+    return (0.0, -0.5) if config.signals.torque.hold == "sample" else (0.0, 0.5)
 
 
 class _Report:
@@ -92,7 +96,7 @@ class _Report:
         self.level = config.estimate.confidence_level
         after = selection.after
         remaining = residual_maps(after.problem, after.basis)
-        unexplained = verdict.is_unexplained(after.basis.rms, remaining)
+        unexplained = verdict.is_unexplained(after.basis.rms, remaining, both=after.problem.both)
         self.verdict = verdict.decide(selection, unexplained)
         # What does not explain the record is not named: the baseline stands, and the place of its mismatch.
         self.final: Fitted = selection.before if unexplained else after
@@ -110,8 +114,13 @@ class _Report:
         solved_after = solved(after) if after is not before else solved_before
         named = self._effects(solved_after)
         held_out = self._held_out()
-        parameters_before = base_estimates(before, solved_before, level=self.level, **self.units)
-        parameters_after = base_estimates(after, solved_after, level=self.level, **self.units)
+        doubt = self._doubt()
+        parameters_before = tuple(
+            demoted(e, doubt) for e in base_estimates(before, solved_before, level=self.level, **self.units)
+        )
+        parameters_after = tuple(
+            demoted(e, doubt) for e in base_estimates(after, solved_after, level=self.level, **self.units)
+        )
         place = self._place()
         share = 1.0 - max(after.cost - after.y.size, 0.0) / max(before.cost - before.y.size, 1e-300)
         equation, variable = (place.equation, place.variable) if place else ("motor", "velocity")
@@ -133,6 +142,14 @@ class _Report:
             traces=traces(before, after, self.recording.torque_unit),
             maps=tuple(residual_map(before, after, m, self.recording) for m in self.maps[:1]),
         )
+
+    def _doubt(self) -> str:
+        """Why no parameter counts as identified, or nothing."""
+        if self.verdict == "unexplained":
+            return "the model leaves out something that is not known"
+        if not self.final.problem.both and not self.final.problem.settled:
+            return "no resonance stands out of the record, so the motor encoder alone does not show the stiffness"
+        return ""
 
     def _effects(self, result: object) -> tuple[NamedEffect, ...]:
         final = self.final
@@ -235,11 +252,11 @@ class _Report:
     def _notes(self) -> tuple[str, ...]:
         problem = self.final.problem
         notes = [f"compared up to {problem.band_hz:.3g} Hz, where the encoders resolve the motion"]
-        if len(self.fitter.holds) > 1:
-            how = "held from its stamp for one sample" if problem.hold else "measured at its stamp"
-            notes.append(
-                f"the torque fits best as {how}; signals.{self.config.signals.torque_role}.hold declares it"
-            )
+        role = self.config.signals.torque_role
+        if problem.shift > 0.0:
+            notes.append(f"the torque fits best as held from its stamp for one sample: signals.{role}.hold: sample")
+        if problem.shift < 0.0:
+            notes.append(f"the torque fits best as measured at its stamp, not held: signals.{role}.hold: instant")
         return tuple(notes)
 
 

@@ -77,7 +77,7 @@ def cross_validated(fitter: Fitter, before: Fitted, after: Fitted) -> tuple[Arra
 
 def predicted(problem: Problem, fitter: Fitter, fitted: Fitted) -> Array:
     """Residual rows of another record with all parameters of ``fitted``; both share one linearisation's names."""
-    there = fitter.fit(problem.at(fitted.problem.base, hold=fitted.problem.hold), fitted.chosen)
+    there = fitter.fit(problem.at(fitted.problem.base, shift=fitted.problem.shift), fitted.chosen)
     coefficients = fitted.basis.coefficients
     if problem.both:
         return np.asarray(there.y - there.basis.columns @ coefficients)

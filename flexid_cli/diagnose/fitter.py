@@ -51,6 +51,14 @@ class Fitted:
         """Sum of squares that is left."""
         return self.basis.cost
 
+    @property
+    def loss(self) -> float:
+        """Logarithm of the cost, comparable between linearisations that weigh the rows differently.
+
+        Twice the negative logarithm of the likelihood, for noise of the known shape and a free size, a row.
+        """
+        return float(np.log(max(self.basis.cost, 1e-300))) + self.problem.level
+
     def amplitudes(self, k: int) -> Array:
         """Amplitudes of the k-th chosen effect."""
         chosen = self.chosen[k]
@@ -78,12 +86,12 @@ class Fitter:
     ----------
     forms : sequence of Form
         Effects that may be tried.
-    holds : tuple of bool
-        Whether the torque may be measured at its stamp (False), held for a period (True), or either.
+    shifts : tuple of float
+        Periods by which the torque may act later than its stamp says.
     """
 
-    def __init__(self, forms: Sequence[Form], holds: tuple[bool, ...]) -> None:
-        self.forms, self.holds = tuple(forms), holds
+    def __init__(self, forms: Sequence[Form], shifts: tuple[float, ...]) -> None:
+        self.forms, self.shifts = tuple(forms), shifts
 
     def fit(self, problem: Problem, chosen: Sequence[Chosen] = (), search: Search | None = None) -> Fitted:
         """Linear fit at the given shapes."""
@@ -98,13 +106,13 @@ class Fitter:
         return Fitted(problem, search, tuple(chosen), solve(np.hstack(columns), y), y)
 
     def relax(self, problem: Problem, chosen: Sequence[Chosen] = (), rounds: int = 3) -> Fitted:
-        """Fit; move linearisation, reversal widths, hold and shapes; until nothing changes or ``rounds`` are over."""
+        """Fit; move linearisation, reversal widths, the torque's timing and shapes; until nothing changes or ``rounds`` are over."""
         fitted = self.fit(problem, chosen)
         best = fitted
         for _ in range(rounds):
             base = self._widths(fitted, self.moved(fitted))
-            fitted = self._shapes(self.fit(problem.at(base, hold=self._hold(fitted)), fitted.chosen))
-            gained = np.log(best.cost / fitted.cost)
+            fitted = self._shapes(self.fit(problem.at(base, shift=self._shift(fitted)), fitted.chosen))
+            gained = best.loss - fitted.loss
             best = fitted if gained > 0.0 else best
             if abs(gained) < SETTLED:
                 break
@@ -139,15 +147,15 @@ class Fitter:
                 base = replace(base, **{field: float(np.exp(best))})
         return base
 
-    def _hold(self, fitted: Fitted) -> bool:
-        if len(self.holds) == 1:
-            return self.holds[0]
+    def _shift(self, fitted: Fitted) -> float:
+        if len(self.shifts) == 1:
+            return self.shifts[0]
 
-        def cost(hold: bool) -> float:
-            e = fitted.basis.outside(fitted.y + fitted.problem.target(hold=hold) - fitted.search.target)
+        def cost(shift: float) -> float:
+            e = fitted.basis.outside(fitted.y + fitted.problem.target(shift=shift) - fitted.search.target)
             return float(e @ e)
 
-        return min(self.holds, key=cost)
+        return min(self.shifts, key=cost)
 
     def _shapes(self, fitted: Fitted) -> Fitted:
         """Refine the shapes of all effects, one after the other, given the rest."""

@@ -30,6 +30,7 @@ SHORTEST_S = 2.0
 # Torque that no model of a drive predicts, as a share of the torque's RMS: timing, rounding, the finite filters.
 # See docs/diagnosis.md for the calibration.
 MODEL_FLOOR = 0.001
+ASTRAY = 1.6
 BOTH_NAMES = ("Jm", "FVm", "FSm", "K", "c", "JL", "FV", "FS", "MX", "MY")
 ALONE_NAMES = ("Jm", "FVm", "FSm", "K", "JL", "FV", "FS")
 
@@ -94,8 +95,13 @@ class Problem:
     gravity, gear_ratio, duration_s : float
     both : bool
         Motor and load equation from both encoders, or eq. (18) from the motor's alone.
-    hold : bool
-        The torque is held from its stamp for one period.
+    anchor : Base, optional
+        What stiffness and inertias may not leave by more than `ASTRAY`: without a joint encoder they take up what
+        the model lacks.
+    settled : bool
+        Whether the linearisation began at an estimate that can be trusted.
+    shift : float
+        Periods by which the torque acts later than its stamp says: half a one where it is held unsaid.
     """
 
     def __init__(
@@ -109,21 +115,28 @@ class Problem:
         gear_ratio: float,
         duration_s: float,
         both: bool,
-        hold: bool,
+        shift: float,
+        anchor: Base | None = None,
+        settled: bool = True,
     ) -> None:
         self.stretches, self.base, self.noise, self.band_hz = stretches, base, noise, band_hz
         self.gravity, self.gear_ratio, self.duration_s = gravity, gear_ratio, duration_s
-        self.both, self.hold = both, hold
+        self.both, self.shift, self.anchor = both, shift, anchor
+        self.settled = settled
         self.names = BOTH_NAMES if both else ALONE_NAMES
         self.torque_rms = float(np.sqrt(np.mean(np.concatenate([s.torque for s in stretches]) ** 2)))
         self.weights = [Weights(s.taper, self.spectral(s)) for s in stretches]
+        # Eq. (18) is 1 + X2 s + X1 s^2 times the torque: the likelihood is that of the torque.
+        self.level = float(np.mean([w.level - self._passing(w) for w in self.weights]))
         self.motions = [self._motion(s) for s in stretches]
 
-    def at(self, base: Base, *, hold: bool | None = None) -> Problem:
+    def at(self, base: Base, *, shift: float | None = None) -> Problem:
         """The same record linearised elsewhere."""
         return Problem(
             self.stretches, base, self.noise, self.band_hz, gravity=self.gravity, gear_ratio=self.gear_ratio,
-            duration_s=self.duration_s, both=self.both, hold=self.hold if hold is None else hold,
+            duration_s=self.duration_s, both=self.both, shift=self.shift if shift is None else shift,
+            anchor=self.anchor,
+            settled=self.settled,
         )  # fmt: skip
 
     @property
@@ -136,6 +149,14 @@ class Problem:
     def equations(self) -> int:
         """Number of equations: rows of `Rows` come equation by equation."""
         return 2 if self.both else 1
+
+    def _passing(self, weights: Weights) -> float:
+        """Mean logarithm of the torque's gain in the rows."""
+        if self.both:
+            return 0.0
+        omega = 2.0 * np.pi * weights.taper.frequency_hz
+        b = self.base
+        return float(np.mean(np.log(np.abs(1.0 + (1j * b.FV * omega - b.JL * omega**2) / b.K) ** 2)))
 
     def spectral(self, stretch: Stretch) -> Complex:
         omega = 2.0 * np.pi * stretch.taper.frequency_hz
@@ -199,16 +220,16 @@ class Problem:
             return [spectrum]
         return [spectrum, None] if equation == "motor" else [None, spectrum]
 
-    def target(self, *, hold: bool | None = None) -> Array:
+    def target(self, *, shift: float | None = None) -> Array:
         """What the columns are to explain, shape (r,).
 
         Both encoders: the torque. Motor alone: the misfit of eq. (18) at the linearisation.
         """
-        held = self.hold if hold is None else hold
+        late = self.shift if shift is None else shift
 
         def part(s: Stretch, m: Motion) -> list[Complex | None]:
             torque = s.torque if self.both else self.through(s, s.torque)
-            spectrum = _held(s, s.spectrum(torque)) if held else s.spectrum(torque)
+            spectrum = _later(s, s.spectrum(torque), late)
             if self.both:
                 return [spectrum, None]
             b = self.base
@@ -386,6 +407,8 @@ class Problem:
         strong = {
             n: getattr(b, n) * float(np.clip(1.0 + v[n] / getattr(b, n), 0.7, 1.4)) for n in ("Jm", "K", "JL")
         }
+        if self.anchor is not None:
+            strong = {n: float(np.clip(x, getattr(self.anchor, n) / ASTRAY, getattr(self.anchor, n) * ASTRAY)) for n, x in strong.items()}
         return replace(b, **{n: getattr(b, n) + v[n] for n in ("FVm", "FSm", "FV", "FS")}, **strong)
 
 
@@ -397,10 +420,13 @@ def _reversal_step(velocities: Sequence[Array], rate_hz: float, cutoff_hz: float
     return float(np.median(found) * reach) if found.size else 0.0
 
 
-def _held(s: Stretch, spectrum: Complex) -> Complex:
-    """A torque that acts as steps from its stamps on: half a period late, damped by a sinc."""
+def _later(s: Stretch, spectrum: Complex, periods: float) -> Complex:
+    """A torque that acts later; half a period is a hold, which a sinc damps (and whose undoing lifts)."""
+    if periods == 0.0:
+        return spectrum
     f = s.taper.frequency_hz[:, None]
-    return spectrum * np.exp(-1j * np.pi * f * s.period_s) * np.sinc(f * s.period_s)
+    damping = np.sinc(f * s.period_s) ** np.sign(periods)
+    return np.asarray(spectrum * np.exp(-2j * np.pi * f * periods * s.period_s) * damping)
 
 
 def _plus(a: Array | None, b: Array) -> Array:

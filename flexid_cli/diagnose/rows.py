@@ -70,8 +70,11 @@ class Weights:
 
     def __init__(self, taper: Taper, spectral: Complex) -> None:
         self.taper = taper
-        self.inverse = np.linalg.inv(np.linalg.cholesky(spectral))
+        root = np.linalg.cholesky(spectral)
+        self.inverse = np.linalg.inv(root)
         self.equations = spectral.shape[-1]
+        # Mean logarithm of the noise's determinant: what likelihoods of differently weighted rows differ by.
+        self.level = float(2.0 * np.mean(np.log(np.abs(np.diagonal(root, axis1=1, axis2=2)))))
         self.rows = 2 * (taper.frequency_hz.size - 1)
         # Rows are kept where the taper is open at least by half.
         position = np.arange(self.rows) * (taper.transform / self.rows)

@@ -51,7 +51,7 @@ def select(fitter: Fitter, problem: Problem, *, enough: float = ENOUGH) -> Selec
     found = tested
     while len(fitted.chosen) < MOST_EFFECTS:
         new = _added(fitter, fitted, found)
-        if new is None or np.log(fitted.cost / new.cost) < enough:
+        if new is None or fitted.loss - new.loss < enough:
             break
         fitted = _needed(fitter, new, enough)
         found = fitter.candidates(fitted)
@@ -68,15 +68,10 @@ def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted | N
     if possible[0].gain < 0.5 * ENOUGH:
         return None
     trials = [
-        fitter.relax(fitter_problem(fitter, fitted), (*fitted.chosen, Chosen(c.form, c.shape)), rounds=2)
+        fitter.relax(fitted.problem, (*fitted.chosen, Chosen(c.form, c.shape)), rounds=2)
         for c in rivals
     ]
-    return min(trials, key=lambda f: f.cost)
-
-
-def fitter_problem(fitter: Fitter, fitted: Fitted) -> Problem:
-    """The linearisation to start a refit from."""
-    return fitted.problem
+    return min(trials, key=lambda f: f.loss)
 
 
 def _needed(fitter: Fitter, fitted: Fitted, enough: float) -> Fitted:
@@ -104,6 +99,6 @@ def _alternatives(
         near = [c for c, (_, w) in zip(others, worse, strict=True) if w < LOOKED_AT and not c.refused]
         rest = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
         refits = [fitter.relax(fitted.problem, (*rest, Chosen(c.form, c.shape)), rounds=2) for c in near]
-        alternatives.append(tuple(f for f in refits if np.log(f.cost / fitted.cost) < AS_GOOD))
+        alternatives.append(tuple(f for f in refits if f.loss - fitted.loss < AS_GOOD))
         rivals.append(tuple(sorted(worse, key=lambda w: w[1])))
     return tuple(alternatives), tuple(rivals)

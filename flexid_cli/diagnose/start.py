@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import solve
-from flexid_cli.diagnose.fitter import Fitter
+from flexid_cli.diagnose.fitter import Chosen, Fitter
 from flexid_cli.diagnose.problem import SHORTEST_S, SMOOTH_BAND, Problem, Stretch
+from flexid_cli.diagnose.rows import motor_only_noise, two_encoder_noise
 from flexid_cli.effects.motion import Base
 from flexid_cli.errors import DataError
 from flexid_cli.estimate.band import usable_band
@@ -17,15 +19,19 @@ from flexid_cli.estimate.budget import NoiseLevels, noise_levels
 from flexid_cli.pipeline.columns import reversal
 from flexid_cli.signals.recording import Recording
 
+if TYPE_CHECKING:
+    from flexid_cli.config.schema import Config
+
 Array = NDArray[np.float64]
 
 HIGHEST_BAND = 0.2  # of the sampling rate
 FIRST_WIDTH = 0.004  # of the highest speed
 SCAN_POINTS, SCAN_STEPS = 14, 4
+SCANNED_WITH = ("torque_offset", "gravity", "joint_damping", "load_dependent_friction", "viscous_nonlinear")
 SCAN_LOW = 8.0  # lowest locked-motor frequency looked at, cycles in the record
 
 
-def first_problem(recording: Recording, gravity: float, gear_ratio: float, fitter: Fitter) -> Problem:
+def first_problem(recording: Recording, config: Config, fitter: Fitter) -> Problem:
     """The record in its band, linearised where a simple fit puts it.
 
     Raises
@@ -47,12 +53,14 @@ def first_problem(recording: Recording, gravity: float, gear_ratio: float, fitte
     width = FIRST_WIDTH * speed
     base = (_both_base if both else _rigid_base)(stretches, width)
     problem = Problem(
-        stretches, base, noise_levels(recording), band, gravity=gravity, gear_ratio=gear_ratio,
-        duration_s=recording.duration_s, both=both, hold=fitter.holds[0],
+        stretches, base, noise_levels(recording), band, gravity=config.axis.gravity_m_per_s2, gear_ratio=config.axis.gear_ratio,
+        duration_s=recording.duration_s, both=both, shift=fitter.shifts[0],
     )  # fmt: skip
     if not both:
-        problem = _scanned(problem, fitter)
-    return _with_torque_noise(fitter.relax(problem, rounds=1).problem)
+        known = _identified(recording, config, width)
+        problem = _scanned(problem, fitter) if known is None else problem.at(known)
+        problem.anchor, problem.settled = problem.base, known is not None
+    return _with_torque_noise(fitter.relax(problem, rounds=1).problem if both else problem)
 
 
 def _both_base(stretches: list[Stretch], width: float) -> Base:
@@ -131,15 +139,36 @@ def _rigid_base(stretches: list[Stretch], width: float) -> Base:
     )  # fmt: skip
 
 
+def _identified(recording: Recording, config: Config, width: float) -> Base | None:
+    """Parameters by `identify`, which gravity and offset do not lead astray; None where it finds no resonance."""
+    from flexid_cli.estimate.identify import identify
+
+    try:
+        model = identify(recording, config.model_copy(update={"models": ("motor_only",)})).models[0]
+    except DataError:
+        return None
+    v = {e.symbol: e.value for e in model.parameters if e.value is not None}
+    if not all(v.get(name, 0.0) > 0.0 for name in ("Jm", "K", "JL")):
+        return None
+    reversal_width = model.pipeline.reversal_velocity or width
+    friction = {name: v.get(name, 0.0) for name in ("FVm", "FSm", "FV", "FS")}
+    return Base(v["Jm"], v["K"], v["JL"], **friction, motor_reversal=reversal_width, load_reversal=reversal_width)
+
+
 def _scanned(problem: Problem, fitter: Fitter) -> Problem:
-    """The best of a series of locked-motor frequencies, each followed for a few Gauss-Newton steps."""
+    """The most likely of a series of locked-motor frequencies, each followed for a few Gauss-Newton steps.
+
+    Effects that are linear in their amplitudes are in the fit, so that what the baseline lacks does not draw its
+    stiffness away.
+    """
+    free = [Chosen(f, ()) for f in fitter.forms if f.name in SCANNED_WITH and not f.signature.shapes(problem.scale())]
     base, trials = problem.base, []
     low = SCAN_LOW / problem.duration_s
     for frequency in np.geomspace(max(low, 0.02 * problem.band_hz), 0.8 * problem.band_hz, SCAN_POINTS):
         trial = problem.at(replace(base, K=base.JL * (2.0 * np.pi * float(frequency)) ** 2))
         for _ in range(SCAN_STEPS):
-            trial = trial.at(fitter.moved(fitter.fit(trial)))
-        trials.append((fitter.fit(trial).cost, trial))
+            trial = trial.at(fitter.moved(fitter.fit(trial, free)))
+        trials.append((fitter.fit(trial, free).loss, trial))
     return min(trials, key=lambda t: t[0])[1]
 
 
@@ -151,23 +180,30 @@ def _with_torque_noise(problem: Problem) -> Problem:
     from scipy.signal import welch
 
     s = max(problem.stretches, key=lambda s: s.torque.size)
-    b, noise = problem.base, problem.noise
-    rest = s.torque - b.Jm * s.derivative(s.motor, 2) - b.FVm * s.derivative(s.motor, 1)
-    rest = rest - b.FSm * reversal(s.motor_sharp, b.motor_reversal)
-    if problem.both:
-        rest = rest - b.K * (s.motor - s.joint)
-    cut = rest[100:-100]
-    length = int(min(cut.size, 1024))
-    f, density = welch(cut, fs=s.rate_hz, nperseg=length)
+    noise = problem.noise
+    rest = _misfit(problem, s)[100:-100]
+    f, density = welch(rest, fs=s.rate_hz, nperseg=int(min(rest.size, 1024)))
     use = (f > 1.1 * problem.band_hz) & (f < min(2.2 * problem.band_hz, 0.3 * s.rate_hz))
     if not use.any():
         return problem
     omega = 2.0 * np.pi * f[use]
-    stiffness = b.K if problem.both else 0.0
-    encoders = ((b.Jm * omega**2 - stiffness) * noise.motor_position) ** 2 + (
-        stiffness * noise.joint_position
-    ) ** 2
-    left = np.median(density[use] * 0.5 * s.rate_hz - encoders)
+    encoders = NoiseLevels(0.0, noise.motor_position, noise.joint_position)
+    make = two_encoder_noise if problem.both else motor_only_noise
+    known = make(problem.base, encoders, omega)[:, 0, 0].real
+    b = problem.base
+    passed = 1.0 if problem.both else np.abs(1.0 + (1j * b.FV * omega - b.JL * omega**2) / b.K) ** 2
+    left = float(np.median((density[use] * 0.5 * s.rate_hz - known) / passed))
     torque = float(np.sqrt(max(left, noise.torque**2)))
     problem.noise = NoiseLevels(torque, noise.motor_position, noise.joint_position)
-    return problem.at(b)
+    return problem.at(problem.base)
+
+
+def _misfit(problem: Problem, s: Stretch) -> Array:
+    """Misfit of the motor equation, or of eq. (18), over time."""
+    b = problem.base
+    acceleration, velocity = s.derivative(s.motor, 2), s.derivative(s.motor, 1)
+    rest = s.torque - b.Jm * acceleration - b.FVm * velocity - b.FSm * reversal(s.motor_sharp, b.motor_reversal)
+    if problem.both:
+        return np.asarray(rest - b.K * (s.motor - s.joint))
+    load = b.JL * acceleration + b.FV * velocity + b.FS * reversal(s.motor_sharp, b.load_reversal)
+    return np.asarray(problem.through(s, rest) - load)

@@ -12,6 +12,8 @@ from flexid_cli.diagnose.selection import Selection
 # RMS of whitened rows that the finite filters leave of a complete model.
 UNEXPLAINED_GAIN = 0.25
 UNEXPLAINED_RMS = 2.5
+# Without a joint encoder the joint's motion is rebuilt, and its reversals are blurred.
+UNEXPLAINED_GAIN_ALONE = 0.5
 # A record whose torque stands less than this above its own noise cannot be judged.
 LEAST_SIGNAL = 10.0
 
@@ -40,9 +42,10 @@ VARIABLES = {
 }
 
 
-def is_unexplained(rms: float, maps: Sequence[Map]) -> bool:
+def is_unexplained(rms: float, maps: Sequence[Map], *, both: bool) -> bool:
     """Whether a model leaves what its noise does not explain."""
-    return rms > UNEXPLAINED_RMS or (bool(maps) and maps[0].gain > UNEXPLAINED_GAIN)
+    limit = UNEXPLAINED_GAIN if both else UNEXPLAINED_GAIN_ALONE
+    return rms > UNEXPLAINED_RMS or (bool(maps) and maps[0].gain > limit)
 
 
 def decide(selection: Selection, unexplained: bool) -> Verdict:
