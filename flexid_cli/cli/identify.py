@@ -18,9 +18,9 @@ from flexid_cli.cli.options import (
     pass_console,
     set_option,
     verbosity_options,
-    wants_color,
 )
-from flexid_cli.cli.reading import read_options, reading, warn_of_damage
+from flexid_cli.cli.reading import read_options, reading
+from flexid_cli.cli.reports import QUIETEST, input_files, show_report, tell_of_reading, write_reports
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,13 +28,10 @@ if TYPE_CHECKING:
 
     from flexid_cli.config.schema import Config
     from flexid_cli.estimate.result import Identification
-    from flexid_cli.readers.base import Damage as RawDamage
     from flexid_cli.readers.base import RawLog, ReadOptions
-    from flexid_cli.report.document import InputFile
     from flexid_cli.signals.recording import Recording
 
 NOTHING_IDENTIFIED = 3
-QUIETEST = -1  # with -qq the report stays out too
 
 
 @click.command(
@@ -92,13 +89,15 @@ def identify(
     with reading(console, start, end, strict=strict, keep_suspect=keep_suspect) as options:
         recording, raw = build_recording(logs, loaded, options)
     identification, document = run_identify(logs, loaded, console, recording, raw, options)
-    _write([path for path in outputs if path != STDOUT], document, identification, console, force=force)
+    write_reports(
+        [path for path in outputs if path != STDOUT], document, identification, console, force=force
+    )
     if as_json or STDOUT in outputs:
         from flexid_cli.report.json import render_json
 
         write_text_atomic(STDOUT, render_json(document))
     elif console.verbosity >= QUIETEST:
-        _show(document)
+        show_report(document)
     if not _anything_identified(identification):
         console.error(
             "no parameter could be identified from this recording",
@@ -120,77 +119,16 @@ def run_identify(
     from flexid_cli.estimate.identify import identify as estimate
     from flexid_cli.report.document import build_document
 
-    warn_of_damage(console, raw.damage, suspect_kept=options.keep_suspect)
-    console.detail(f"read {recording.samples} samples at {recording.sample_rate_hz:.6g} Hz from {raw.format}")
-    for step in recording.history:
-        console.detail(f"  {step}")
+    tell_of_reading(console, recording, raw, options)
     identification = estimate(recording, config)
     document = build_document(
         identification=identification,
         recording=recording,
-        inputs=_inputs(logs, raw),
+        inputs=input_files(logs, raw),
         config_digest=config_digest(config),
         config_resolved=config.resolved(),
     )
     return identification, document
-
-
-def _inputs(logs: Sequence[Path], raw: RawLog) -> list[InputFile]:
-    from flexid_cli.readers.digest import digest
-    from flexid_cli.report.document import Damage, InputFile
-
-    notes = tuple(note.message for note in raw.notes)
-    damage = dict(zip(raw.paths, raw.damage, strict=False))
-    return [
-        InputFile(
-            path=str(log),
-            sha256=digest(log),
-            format=raw.format,
-            damage=None if log not in damage else Damage(**_fields_of(damage[log])),
-            notes=notes if k == 0 else (),
-        )
-        for k, log in enumerate(logs)
-    ]
-
-
-def _fields_of(damage: RawDamage) -> dict[str, Any]:
-    from dataclasses import fields
-
-    return {field.name: getattr(damage, field.name) for field in fields(damage) if field.name != "path"}
-
-
-def _write(
-    files: Sequence[Path],
-    document: dict[str, Any],
-    identification: Identification,
-    console: Console,
-    *,
-    force: bool,
-) -> None:
-    from flexid_cli.report.write import render_outputs
-    from flexid_cli.writers.files import write_files
-
-    if not files:
-        return
-    contents = render_outputs(document, identification, files)
-    write_files(contents, force=force)
-    figures = len(contents) - len(files)
-    beside = f" and {figures} figures beside" if figures else ""
-    console.info(f"wrote {', '.join(str(path) for path in files)}{beside}")
-
-
-def _show(document: dict[str, Any]) -> None:
-    import sys
-
-    from rich.console import Console as Terminal
-
-    from flexid_cli.report.console import print_report
-
-    terminal = Terminal(file=sys.stdout, no_color=wants_color() is False, highlight=False)
-    # Captured, for rich itself would end the program with 1 where nobody reads the output any more.
-    with terminal.capture() as capture:
-        print_report(document, terminal)
-    click.echo(capture.get(), nl=False, color=True)
 
 
 def _anything_identified(identification: Identification) -> bool:

@@ -48,14 +48,24 @@ COMMANDS = {
     "identify": CommandEntry(
         "flexid_cli.cli.identify", "identify", "Estimate stiffness, inertias and friction from a log."
     ),
+    "diagnose": CommandEntry(
+        "flexid_cli.cli.diagnose", "diagnose", "Find what physics a model leaves out of a recording."
+    ),
     "tune-filter": CommandEntry(
         "flexid_cli.cli.tune_filter", "tune_filter", "Design the data filter and the decimation."
+    ),
+    "simulate": CommandEntry(
+        "flexid_cli.cli.simulate", "simulate", "Simulate a log of a known axis, or a recording once more."
     ),
     "inspect": CommandEntry(
         "flexid_cli.cli.inspect", "inspect", "List a log's channels, rates and gaps; propose a configuration."
     ),
     "check": CommandEntry(
         "flexid_cli.cli.check", "check", "Check a configuration, and that a log has its signals."
+    ),
+    "effects": CommandEntry("flexid_cli.cli.effects", "effects", "List the effects that diagnose knows."),
+    "explain": CommandEntry(
+        "flexid_cli.cli.explain", "explain", "Say what an effect is, and what to do about it."
     ),
     "schema": CommandEntry(
         "flexid_cli.cli.schema", "schema", "Print the JSON Schema of the configuration or the report."

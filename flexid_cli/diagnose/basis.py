@@ -27,15 +27,12 @@ class Basis:
         The shortest solution in scaled units.
     cost : float
         Sum of squares of the residual.
-    covariance : ndarray, shape (p, p)
-        Of the coefficients for rows of unit variance.
     """
 
     columns: Array
     Q: Array
     residual: Array
     coefficients: Array
-    covariance: Array
 
     @property
     def cost(self) -> float:
@@ -53,7 +50,17 @@ class Basis:
 
 
 def solve(columns: Array, y: Array) -> Basis:
-    """Basis of ``columns`` and the solution for ``y``."""
+    """Solve a least-squares problem whose columns may depend on each other.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (r, p)
+    y : ndarray, shape (r,)
+
+    Returns
+    -------
+    Basis
+    """
     scale = np.linalg.norm(columns, axis=0)
     scale[scale == 0.0] = 1.0
     # A Gram matrix would be faster and lose half the digits of nearly dependent columns.
@@ -64,5 +71,4 @@ def solve(columns: Array, y: Array) -> Basis:
     solution = Vt[keep].T / s[keep]
     residual = y - Q @ projected
     residual -= Q @ (Q.T @ residual)
-    covariance = (solution @ solution.T) / np.outer(scale, scale)
-    return Basis(columns, Q, residual, (solution @ projected) / scale, covariance)
+    return Basis(columns, Q, residual, (solution @ projected) / scale)

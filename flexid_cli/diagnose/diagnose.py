@@ -16,10 +16,11 @@ from flexid_cli.diagnose.location import Map, located, residual_maps
 from flexid_cli.diagnose.physical import torque_scale
 from flexid_cli.diagnose.result import Diagnosis, Evidence, HeldOut, NamedEffect, Tested, Where
 from flexid_cli.diagnose.search import Form
-from flexid_cli.diagnose.selection import ENOUGH, Selection, select
+from flexid_cli.diagnose.selection import Selection, select, threshold
 from flexid_cli.diagnose.simulation import simulation_error
 from flexid_cli.diagnose.start import first_problem
 from flexid_cli.effects.base import EffectValues
+from flexid_cli.estimate.result import Estimate
 from flexid_cli.estimate.verdict import demoted
 from flexid_cli.effects.registry import effects as library
 
@@ -34,6 +35,8 @@ def diagnose(
     recording: Recording,
     config: Config,
     validation: Recording | None = None,
+    *,
+    known: Mapping[str, float] | None = None,
 ) -> Diagnosis:
     """Find where the declared baseline and a recording differ, and what was left out.
 
@@ -45,6 +48,9 @@ def diagnose(
         Axis, signals and confidence level.
     validation : Recording, optional
         Another recording of the axis: effects fitted to the first one are checked on it.
+    known : mapping of str to float, optional
+        Parameters by symbol that are held to be true, as a report or a data sheet gives them: the simulation before
+        runs with them, and a note names those that the recording contradicts.
 
     Returns
     -------
@@ -59,7 +65,7 @@ def diagnose(
     fitter = Fitter(_forms(both), _shifts(config))
     problem = first_problem(recording, config, fitter)
     selection = select(fitter, problem)
-    return _Report(fitter, selection, recording, config, validation).diagnosis()
+    return _Report(fitter, selection, recording, config, validation, known or {}).diagnosis()
 
 
 def _forms(both: bool) -> list[Form]:
@@ -90,9 +96,11 @@ class _Report:
         recording: Recording,
         config: Config,
         validation: Recording | None,
+        known: Mapping[str, float],
     ) -> None:
         self.fitter, self.selection, self.recording, self.config = fitter, selection, recording, config
         self.units = {"linear": recording.linear, "torque_unit": recording.torque_unit}
+        self.known = known
         self.level = config.estimate.confidence_level
         after = selection.after
         remaining = residual_maps(after.problem, after.basis)
@@ -103,9 +111,7 @@ class _Report:
         self.maps = residual_maps(selection.before.problem, selection.before.basis)
         self.other = None
         if validation is not None:
-            self.other = first_problem(
-                validation, config.axis.gravity_m_per_s2, config.axis.gear_ratio, fitter
-            )
+            self.other = first_problem(validation, config, fitter)
 
     def diagnosis(self) -> Diagnosis:
         """Assemble the result."""
@@ -138,7 +144,7 @@ class _Report:
             next_recording=verdict.advice(
                 named, {e.name: e.best_recording for e in library()}, self.verdict, variable
             ),
-            notes=self._notes(),
+            notes=(*self._notes(), *self._contradicted(parameters_after)),
             traces=traces(before, after, self.recording.torque_unit),
             maps=tuple(residual_map(before, after, m, self.recording) for m in self.maps[:1]),
         )
@@ -169,7 +175,7 @@ class _Report:
                     family=effect.family,
                     alternatives=tuple(dict.fromkeys(alternatives)),
                     parameters=effect_estimates(final, k, result, level=self.level, **self.units),
-                    evidence=Evidence(gains[k], ENOUGH, score.p_value, validated, score.stability),
+                    evidence=Evidence(gains[k], threshold(final.problem), score.p_value, validated, score.stability),
                     where=Where(effect.equation, _variable(effect.equation, self.maps)),
                 )
             )
@@ -183,7 +189,7 @@ class _Report:
     def _unseen(self, final: Fitted) -> tuple[Array, Array]:
         """Residual rows of both models on data that they were not fitted to."""
         if self.other is None:
-            return evidence.cross_validated(self.fitter, self.selection.before, final)
+            return evidence.cross_validated(self.selection.before), evidence.cross_validated(final)
         first = evidence.predicted(self.other, self.fitter, self.selection.before)
         return first, evidence.predicted(self.other, self.fitter, final)
 
@@ -211,7 +217,7 @@ class _Report:
         position = "m" if self.recording.linear else "rad"
         return simulation_error(
             final.problem,
-            {e.symbol: e.value for e in before if e.value is not None},
+            {e.symbol: e.value for e in before if e.value is not None} | dict(self.known),
             {e.symbol: e.value for e in after if e.value is not None},
             values,
             unit=self.recording.torque_unit,
@@ -219,7 +225,7 @@ class _Report:
         )
 
     def _place(self) -> Where | None:
-        return located(self.selection.before, self.maps[0], self.recording) if self.maps else None
+        return located(self.maps[0], self.recording) if self.maps else None
 
     def _tested(self) -> tuple[Tested, ...]:
         chosen = {c.name for c in self.final.chosen}
@@ -243,11 +249,22 @@ class _Report:
             elif chosen and effect.name in rivals:
                 reason = f"leaves {100.0 * np.expm1(rivals[effect.name]):.3g} % more than the effects that were named"
             else:
-                reason = f"explains too little (gain below {ENOUGH:g})"
+                reason = f"explains too little (gain below {threshold(self.final.problem):g})"
             out.append(
                 Tested(effect.name, effect.code, None if candidate is None else candidate.gain, reason)
             )
         return tuple(out)
+
+    def _contradicted(self, estimates: tuple[Estimate, ...]) -> tuple[str, ...]:
+        """Known parameters that lie outside their intervals."""
+        return tuple(
+            f"{e.symbol} = {self.known[e.symbol]:.6g} {e.unit} was given; the recording says {e.interval.low:.6g} to"
+            f" {e.interval.high:.6g}"
+            for e in estimates
+            if e.symbol in self.known
+            and e.interval is not None
+            and not e.interval.low <= self.known[e.symbol] <= e.interval.high
+        )
 
     def _notes(self) -> tuple[str, ...]:
         problem = self.final.problem

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.fitter import Fitted
-from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.problem import MODEL_FLOOR, Problem, Stretch
 from flexid_cli.effects.base import unit_of
-from flexid_cli.estimate.covariance import robust_covariance
+from flexid_cli.estimate.covariance import RobustCovariance, robust_covariance
 from flexid_cli.estimate.result import Estimate
 from flexid_cli.estimate.verdict import judge
 from flexid_cli.models.base import Parameter
@@ -32,6 +32,8 @@ BASE_PARAMETERS = (
 )
 NOISE_SEEDS = (20010521, 20010522)
 DOUBT_OF_CORRECTION = 0.5  # share of the noise's bias that its correction may be wrong by
+# A torque that no model predicts better than MODEL_FLOOR gives no parameter better than this share of it.
+FLOOR_SHARE = 0.5
 SHAPE_STEP = 0.01  # relative step of a shape parameter for its derivative
 
 
@@ -50,17 +52,30 @@ def solved(fitted: Fitted) -> Solved:
     The encoders' noise stands in the columns too; its part of the normal matrix is that of a record of noise alone
     that passes the same chain, and is taken off.
     """
-    problem, X = fitted.problem, fitted.basis.columns
+    X, plain = fitted.basis.columns, fitted.basis.coefficients
+    bread = _bread(X)
+    shift = _noise_shift(fitted, bread) if fitted.problem.both else np.zeros_like(plain)
+    robust = _robust(fitted, X, bread)
+    doubt = DOUBT_OF_CORRECTION * shift
+    whole = plain + shift
+    size = np.abs(whole)
+    if not problem.both:
+        size[: len(problem.names)] += [abs(getattr(problem.base, name)) for name in problem.names]
+    floor = np.diag((FLOOR_SHARE * MODEL_FLOOR * size) ** 2)
+    return Solved(whole, robust.covariance + np.outer(doubt, doubt) + floor, robust.degrees_of_freedom)
+
+
+def _bread(X: Array) -> Array:
+    """Inverse of the normal matrix."""
     scale = np.linalg.norm(X, axis=0)
     scale[scale == 0.0] = 1.0
-    bread = np.linalg.pinv((X / scale).T @ (X / scale)) / np.outer(scale, scale)
-    plain = fitted.basis.coefficients
-    shift = _noise_shift(fitted, bread) if problem.both else np.zeros_like(plain)
-    rows = fitted.y.size // problem.equations
-    scores = (X * fitted.basis.residual[:, None]).reshape(problem.equations, rows, -1).sum(axis=0)
-    robust = robust_covariance(scores, bread, [int(w.open.sum()) for w in problem.weights])
-    doubt = DOUBT_OF_CORRECTION * shift
-    return Solved(plain + shift, robust.covariance + np.outer(doubt, doubt), robust.degrees_of_freedom)
+    return np.asarray(np.linalg.pinv((X / scale).T @ (X / scale)) / np.outer(scale, scale))
+
+
+def _robust(fitted: Fitted, X: Array, bread: Array) -> RobustCovariance:
+    """Covariance of the coefficients of columns, from the fit's residual; equations share their time."""
+    scores = (X * fitted.basis.residual[:, None]).reshape(fitted.problem.equations, -1, X.shape[1]).sum(axis=0)
+    return robust_covariance(scores, bread, [int(w.open.sum()) for w in fitted.problem.weights])
 
 
 def _noise_shift(fitted: Fitted, bread: Array) -> Array:
@@ -69,16 +84,16 @@ def _noise_shift(fitted: Fitted, bread: Array) -> Array:
     p = len(problem.names)
     normal, right = np.zeros((size, size)), np.zeros(size)
     for seed in NOISE_SEEDS:
-        columns, y = _noise_rows(problem, seed)
+        columns = _noise_rows(problem, seed)
         normal[:p, :p] += columns.T @ columns / len(NOISE_SEEDS)
-        right[:p] += columns.T @ (y - columns @ fitted.basis.coefficients[:p]) / len(NOISE_SEEDS)
-    # (H - N) b = X'y - V'v; with b = b0 + d: (H - N) d = N b0 - V'v = -V'(v - V b0).
+        right[:p] += columns.T @ (columns @ fitted.basis.coefficients[:p]) / len(NOISE_SEEDS)
+    # (H - N) b = X'y, for the target is free of this noise; with b = b0 + d: (H - N) d = N b0.
     reduced = np.linalg.pinv(bread) - normal
-    return np.asarray(-np.linalg.lstsq(reduced, right, rcond=1e-12)[0], dtype=np.float64)
+    return np.asarray(np.linalg.lstsq(reduced, right, rcond=1e-12)[0], dtype=np.float64)
 
 
-def _noise_rows(problem: Problem, seed: int) -> tuple[Array, Array]:
-    """Baseline columns and target of a record that holds nothing but the encoders' noise."""
+def _noise_rows(problem: Problem, seed: int) -> Array:
+    """Baseline columns of a record that holds nothing but the encoders' noise."""
     rng = np.random.default_rng(seed)
     noisy = []
     for s in problem.stretches:
@@ -130,7 +145,7 @@ def effect_estimates(
     form, base = chosen.form, fitted.problem.base
     amplitudes = fitted.amplitudes(k)
     values = form.signature.values(amplitudes, chosen.shape, base)
-    spread = _value_spread(fitted, k, result)
+    spread = _value_spread(fitted, k)
     dof = float(np.min(result.degrees_of_freedom))
     out = []
     for p in form.effect.parameters:
@@ -144,46 +159,40 @@ def effect_estimates(
     return tuple(out)
 
 
-def _value_spread(fitted: Fitted, k: int, result: Solved) -> dict[str, float]:
+def _value_spread(fitted: Fitted, k: int) -> dict[str, float]:
     """Standard errors of an effect's values: its tangent columns beside the whole model."""
-    chosen = fitted.chosen[k]
-    signature, base = chosen.form.signature, fitted.problem.base
-    amplitudes = np.atleast_1d(fitted.amplitudes(k))
+    tangents, others = _tangents(fitted, k), fitted.basis.columns
+    if fitted.chosen[k].form.signature.fixed is None:
+        others = np.delete(others, fitted.columns(k), axis=1)
+    X, count = np.hstack([others, tangents]), tangents.shape[1]
+    covariance = _robust(fitted, X, _bread(X)).covariance[-count:, -count:]
+    jacobian = _jacobian(fitted, k, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    return {name: float(np.sqrt(max(g @ covariance @ g, 0.0))) for name, g in jacobian.items()}
+
+
+def _tangents(fitted: Fitted, k: int) -> Array:
+    """Derivatives of an effect's rows by its free amplitudes and its shapes, shape (r, p)."""
+    chosen, amplitudes = fitted.chosen[k], fitted.amplitudes(k)
     rows = fitted.search.rows(chosen.form, chosen.shape)
-    free = signature.fixed is None
-    tangents = [rows[:, j] for j in range(rows.shape[1])] if free else []
-    names = [("amplitude", j) for j in range(len(tangents))]
+    tangents = [rows] if chosen.form.signature.fixed is None else []
     for j, value in enumerate(chosen.shape):
         step = SHAPE_STEP * (abs(value) or 1.0)
         moved = (*chosen.shape[:j], value + step, *chosen.shape[j + 1 :])
-        tangents.append((fitted.search.rows(chosen.form, moved) - rows) @ amplitudes[: rows.shape[1]] / step)
-        names.append(("shape", j))
-    own = fitted._columns(k) if free else slice(0, 0)
-    others = np.delete(fitted.basis.columns, np.arange(fitted.basis.columns.shape[1])[own], axis=1)
-    X = np.column_stack([others, *tangents])
-    scale = np.linalg.norm(X, axis=0)
-    scale[scale == 0.0] = 1.0
-    bread = np.linalg.pinv((X / scale).T @ (X / scale)) / np.outer(scale, scale)
-    equations = fitted.problem.equations
-    scores = (X * fitted.basis.residual[:, None]).reshape(equations, -1, X.shape[1]).sum(axis=0)
-    lengths = [int(w.open.sum()) for w in fitted.problem.weights]
-    covariance = robust_covariance(scores, bread, lengths).covariance[-len(tangents) :, -len(tangents) :]
-    centre = signature.values(amplitudes, chosen.shape, base)
-    jacobian: dict[str, list[float]] = {name: [] for name in centre}
-    for i, (kind, j) in enumerate(names):
-        step = max(
-            1e-3 * float(np.sqrt(max(covariance[i, i], 0.0))),
-            1e-9 * abs(amplitudes[j] if kind == "amplitude" else chosen.shape[j]),
-            1e-300,
-        )
-        a, shape = amplitudes.copy(), list(chosen.shape)
-        if kind == "amplitude":
-            a[j] += step
-        else:
-            shape[j] += step
-        there = signature.values(a, tuple(shape), base)
-        for name, value in centre.items():
-            jacobian[name].append((there[name] - value) / step)
-    return {
-        name: float(np.sqrt(max(np.array(g) @ covariance @ np.array(g), 0.0))) for name, g in jacobian.items()
-    }
+        change = (fitted.search.rows(chosen.form, moved) - rows) @ amplitudes / step
+        tangents.append(change[:, None])
+    return np.hstack(tangents)
+
+
+def _jacobian(fitted: Fitted, k: int, errors: Array) -> dict[str, Array]:
+    """Derivatives of each of an effect's values by its free amplitudes and its shapes, in steps of their errors."""
+    chosen, amplitudes, base = fitted.chosen[k], fitted.amplitudes(k), fitted.problem.base
+    signature = chosen.form.signature
+    free = amplitudes.size if signature.fixed is None else 0
+
+    def values(at: Array) -> dict[str, float]:
+        return signature.values(at[:free] if free else amplitudes, tuple(at[free:].tolist()), base)
+
+    here = np.concatenate([amplitudes[:free], chosen.shape])
+    steps = np.maximum(np.maximum(1e-3 * errors, 1e-9 * np.abs(here)), 1e-300)
+    centre, moved = values(here), [values(here + d) for d in np.diag(steps)]
+    return {n: np.array([v[n] - c for v in moved]) / steps for n, c in centre.items()}

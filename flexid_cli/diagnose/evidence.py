@@ -30,8 +30,8 @@ class Score:
 def score(fitter: Fitter, fitted: Fitted, k: int, library: int) -> Score:
     """Score test of the k-th effect against the model without it.
 
-    The score's sum over the record is compared with its own spread between blocks, so that coloured residuals do
-    not make it look sure; Bonferroni's correction over the ``library`` that was searched.
+    The score's sum over the record is compared with what the residual of the model with the effect makes of it in
+    blocks of time, so that coloured residuals do not make it look sure; Bonferroni's correction over the ``library`` that was searched.
     """
     from scipy.stats import t as student
 
@@ -40,7 +40,8 @@ def score(fitter: Fitter, fitted: Fitted, k: int, library: int) -> Score:
     rows = fitted.search.rows(chosen.form, chosen.shape)
     column = rest.basis.outside(rows) @ np.atleast_1d(fitted.amplitudes(k))[: rows.shape[1]]
     parts = _blocks(column * rest.basis.residual, fitted.problem, BLOCKS)
-    spread = float(np.std(parts, ddof=1)) * np.sqrt(parts.size)
+    noise = _blocks(column * fitted.basis.residual, fitted.problem, BLOCKS)
+    spread = float(np.sqrt(np.sum(noise**2)))
     statistic = float(parts.sum()) / max(spread, 1e-300)
     p = 2.0 * float(student.sf(abs(statistic), parts.size - 1))
     few = _blocks(column * rest.basis.residual, fitted.problem, STABILITY_BLOCKS)
@@ -55,35 +56,27 @@ def _blocks(values: Array, problem: Problem, count: int) -> Array:
     return np.array([part.sum() for part in np.array_split(by_time, count)])
 
 
-def cross_validated(fitter: Fitter, before: Fitted, after: Fitted) -> tuple[Array, Array]:
-    """Residual rows of both models, each fifth of the record predicted from the rest (with a gap between)."""
-    out = []
-    for fitted in (before, after):
-        rows = fitted.y.size // fitted.problem.equations
-        fold = np.minimum(np.arange(rows) * FOLDS // rows, FOLDS - 1)
-        gap = max(2, rows // 200)
-        columns = fitted.basis.columns
-        residual = np.empty_like(fitted.y)
-        for f in range(FOLDS):
-            inside = fold == f
-            first, last = np.flatnonzero(inside)[[0, -1]]
-            near = (np.arange(rows) >= first - gap) & (np.arange(rows) <= last + gap)
-            train, test = np.tile(~near, fitted.problem.equations), np.tile(inside, fitted.problem.equations)
-            coefficients = solve(columns[train], fitted.y[train]).coefficients
-            residual[test] = fitted.y[test] - columns[test] @ coefficients
-        out.append(residual)
-    return out[0], out[1]
+def cross_validated(fitted: Fitted) -> Array:
+    """Residual rows of a model, each fifth of the record predicted from the rest (with a gap between)."""
+    rows, columns = fitted.y.size // fitted.problem.equations, fitted.basis.columns
+    time = np.arange(rows)
+    fold = np.minimum(time * FOLDS // rows, FOLDS - 1)
+    gap = max(2, rows // 200)
+    residual = np.empty_like(fitted.y)
+    for f in range(FOLDS):
+        inside = fold == f
+        first, last = np.flatnonzero(inside)[[0, -1]]
+        away = (time < first - gap) | (time > last + gap)
+        train, test = np.tile(away, fitted.problem.equations), np.tile(inside, fitted.problem.equations)
+        coefficients = solve(columns[train], fitted.y[train]).coefficients
+        residual[test] = fitted.y[test] - columns[test] @ coefficients
+    return residual
 
 
 def predicted(problem: Problem, fitter: Fitter, fitted: Fitted) -> Array:
     """Residual rows of another record with all parameters of ``fitted``; both share one linearisation's names."""
     there = fitter.fit(problem.at(fitted.problem.base, shift=fitted.problem.shift), fitted.chosen)
-    coefficients = fitted.basis.coefficients
-    if problem.both:
-        return np.asarray(there.y - there.basis.columns @ coefficients)
-    # The motor alone: the target is the misfit at the parameters already; only the effects are added.
-    steps = coefficients.copy()
-    return np.asarray(there.y - there.basis.columns @ steps)
+    return np.asarray(there.y - there.basis.columns @ fitted.basis.coefficients)
 
 
 def held_out_gain(before: Array, after: Array) -> float:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from flexid_cli.diagnose.evidence import by_equation
 from flexid_cli.diagnose.fitter import Fitted
-from flexid_cli.diagnose.location import VARIABLES, Map
+from flexid_cli.diagnose.location import VARIABLES, Map, unit_of_variable
 from flexid_cli.diagnose.physical import torque_scale
 from flexid_cli.diagnose.result import ResidualMap, Traces
 from flexid_cli.signals.recording import Recording
@@ -32,28 +32,25 @@ def traces(before: Fitted, after: Fitted, unit: str) -> Traces:
 def residual_map(before: Fitted, after: Fitted, found: Map, recording: Recording) -> ResidualMap:
     """Binned mean of the residuals over the variable of a map, with 95 % bands of the later one."""
     equation = "motor" if found.equation == "motor" or not before.problem.both else "load"
-    t = before.problem.row_times
-    if found.variable == "frequency":
-        x = t
-    else:
-        value, _ = VARIABLES[found.variable]
-        own = np.concatenate([m.time_s for m in before.problem.motions])
-        x = np.interp(t, own, np.concatenate([value(m, found.equation) for m in before.problem.motions]))
-    edges = np.linspace(*np.quantile(x, [0.002, 0.998]), BINS + 1)
+    variable = "time" if found.variable == "frequency" else found.variable  # a line is shown over time
+    t, value = before.problem.row_times, VARIABLES[variable][0]
+    own = np.concatenate([m.time_s for m in before.problem.motions])
+    x = np.interp(t, own, np.concatenate([value(m, found.equation) for m in before.problem.motions]))
+    low, high = np.quantile(x, [0.002, 0.998])
+    edges = np.linspace(float(low), float(high), BINS + 1)
     which = np.digitize(x, edges) - 1
     size = torque_scale(before.problem)[equation]
     first = size * by_equation(before.problem, before.basis.residual)[equation]
     last = size * by_equation(after.problem, after.basis.residual)[equation]
     rows = [k for k in range(BINS) if np.count_nonzero(which == k) >= LEAST_IN_BIN]
-    unit = "s" if found.variable == "frequency" else ""
     return ResidualMap(
         equation=equation,
-        variable="time" if found.variable == "frequency" else found.variable.split("_times_")[0],
+        variable=variable.split("_times_")[0],
         x=np.array([0.5 * (edges[k] + edges[k + 1]) for k in rows]),
         before=np.array([first[which == k].mean() for k in rows]),
         after=np.array([last[which == k].mean() for k in rows]),
         band=np.array([_band(last[which == k], t[which == k]) for k in rows]),
-        x_unit=unit or _x_unit(found.variable, recording),
+        x_unit=unit_of_variable(variable, recording),
         unit=recording.torque_unit,
     )
 
@@ -65,9 +62,3 @@ def _band(values: Array, t: Array) -> float:
     if means.size < 2:
         return float(1.96 * values.std())
     return float(1.96 * means.std(ddof=1) / np.sqrt(means.size))
-
-
-def _x_unit(variable: str, recording: Recording) -> str:
-    length = "m" if recording.linear else "rad"
-    first = variable.split("_times_", maxsplit=1)[0]
-    return {"velocity": f"{length}/s", "time": "s", "torque": recording.torque_unit}.get(first, length)

@@ -64,15 +64,10 @@ class Fitted:
         chosen = self.chosen[k]
         if chosen.form.signature.fixed is not None:
             return np.array([chosen.form.signature.fixed])
-        return self.basis.coefficients[self._columns(k)]
+        return self.basis.coefficients[self.columns(k)]
 
-    def amplitude_errors(self, k: int) -> Array:
-        """Their standard errors for independent rows."""
-        if self.chosen[k].form.signature.fixed is not None:
-            return np.zeros(1)
-        return self.basis.rms * np.sqrt(np.diag(self.basis.covariance)[self._columns(k)])
-
-    def _columns(self, k: int) -> slice:
+    def columns(self, k: int) -> slice:
+        """Where the columns of the k-th chosen effect stand; it has a free amplitude."""
         first = len(self.problem.names)
         for c in self.chosen[:k]:
             first += 0 if c.form.signature.fixed is not None else self.search.rows(c.form, c.shape).shape[1]
@@ -97,6 +92,9 @@ class Fitter:
         """Linear fit at the given shapes."""
         search = search or Search(problem, self.forms)
         y, columns = search.target, [search.base]
+        for form, amplitudes in problem.applied.items():
+            # What was taken out of the signals counts as found, so that amplitudes are whole ones.
+            y = y + search.rows(form, ()) @ amplitudes
         for c in chosen:
             rows = search.rows(c.form, c.shape)
             if c.form.signature.fixed is not None:
@@ -106,17 +104,30 @@ class Fitter:
         return Fitted(problem, search, tuple(chosen), solve(np.hstack(columns), y), y)
 
     def relax(self, problem: Problem, chosen: Sequence[Chosen] = (), rounds: int = 3) -> Fitted:
-        """Fit; move linearisation, reversal widths, the torque's timing and shapes; until nothing changes or ``rounds`` are over."""
+        """Fit; move linearisation, reversal widths, the torque's timing and shapes.
+
+        That is repeated until nothing changes, or ``rounds`` times.
+        """
         fitted = self.fit(problem, chosen)
         best = fitted
         for _ in range(rounds):
             base = self._widths(fitted, self.moved(fitted))
-            fitted = self._shapes(self.fit(problem.at(base, shift=self._shift(fitted)), fitted.chosen))
+            moved = problem.at(base, shift=self._shift(fitted), applied=self._errors(fitted))
+            fitted = self._shapes(self.fit(moved, fitted.chosen))
             gained = best.loss - fitted.loss
             best = fitted if gained > 0.0 else best
             if abs(gained) < SETTLED:
                 break
         return best
+
+    @staticmethod
+    def _errors(fitted: Fitted) -> dict[Form, Array]:
+        """Errors of the joint's position that the model holds."""
+        return {
+            c.form: fitted.amplitudes(k)
+            for k, c in enumerate(fitted.chosen)
+            if c.form.signature.corrected is not None
+        }
 
     @staticmethod
     def moved(fitted: Fitted) -> Base:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import Basis
-from flexid_cli.diagnose.fitter import Fitted
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.result import Shape, Where
 from flexid_cli.effects.motion import Motion, Terms
@@ -56,32 +55,63 @@ def hats(x: Array, knots: Array) -> Array:
     return out
 
 
-def _TORQUE(m: Motion, equation: str) -> Array:
+def _velocity(m: Motion, equation: str) -> Array:
+    return m.motor_velocity if equation == "motor" else m.joint_velocity
+
+
+def _position(m: Motion, equation: str) -> Array:
+    return m.motor_position if equation != "load" else m.joint_position
+
+
+def _sign(m: Motion, equation: str) -> Array:
+    return m.motor_sign if equation == "motor" else m.joint_sign
+
+
+def _acceleration(m: Motion, _: str) -> Array:
+    return m.joint_acceleration
+
+
+def _torsion(m: Motion, _: str) -> Array:
+    return m.deflection
+
+
+def _load_size(m: Motion, _: str) -> Array:
+    return np.abs(m.deflection)
+
+
+def _spring_torque(m: Motion, _: str) -> Array:
+    return m.base.K * m.deflection
+
+
+def _torque(m: Motion, _: str) -> Array:
     return m.torque
 
 
-# variable -> (its value, what the function multiplies)
-VARIABLES: dict[str, tuple[Callable[[Motion, str], Array], Callable[[Motion, str], Array | float]]] = {
-    "velocity": (lambda m, e: _v(m, e), lambda m, e: 1.0),
-    "position": (lambda m, e: _q(m, e), lambda m, e: 1.0),
-    "position_times_sign": (
-        lambda m, e: _q(m, e),
-        lambda m, e: m.motor_sign if e == "motor" else m.joint_sign,
-    ),
-    "position_times_acceleration": (lambda m, e: _q(m, e), lambda m, e: m.joint_acceleration),
-    "position_times_torsion": (lambda m, e: _q(m, e), lambda m, e: m.base.K * m.deflection),
-    "torsion": (lambda m, e: m.deflection, lambda m, e: m.base.K * m.deflection),
-    "load_times_sign": (
-        lambda m, e: np.abs(m.deflection),
-        lambda m, e: m.motor_sign if e == "motor" else m.joint_sign,
-    ),
-    "torque": (lambda m, e: m.torque, _TORQUE),
-    "time": (lambda m, e: m.time_s, lambda m, e: 1.0),
-    "time_times_sign": (lambda m, e: m.time_s, lambda m, e: m.motor_sign if e == "motor" else m.joint_sign),
-    "time_times_velocity": (lambda m, e: m.time_s, lambda m, e: _v(m, e)),
-    "time_times_acceleration": (lambda m, e: m.time_s, lambda m, e: m.joint_acceleration),
-    "time_times_torsion": (lambda m, e: m.time_s, lambda m, e: m.base.K * m.deflection),
-    "time_times_torque": (lambda m, e: m.time_s, _TORQUE),
+def _time(m: Motion, _: str) -> Array:
+    return m.time_s
+
+
+def _one(m: Motion, _: str) -> Array:
+    return np.ones(m.time_s.size)
+
+
+Quantity = Callable[[Motion, str], Array]
+# variable -> (its value, what the function of it multiplies)
+VARIABLES: dict[str, tuple[Quantity, Quantity]] = {
+    "velocity": (_velocity, _one),
+    "position": (_position, _one),
+    "position_times_sign": (_position, _sign),
+    "position_times_acceleration": (_position, _acceleration),
+    "position_times_torsion": (_position, _spring_torque),
+    "torsion": (_torsion, _spring_torque),
+    "load_times_sign": (_load_size, _sign),
+    "torque": (_torque, _torque),
+    "time": (_time, _one),
+    "time_times_sign": (_time, _sign),
+    "time_times_velocity": (_time, _velocity),
+    "time_times_acceleration": (_time, _acceleration),
+    "time_times_torsion": (_time, _spring_torque),
+    "time_times_torque": (_time, _torque),
 }
 EQUATIONS = {
     "motor": (
@@ -110,14 +140,6 @@ EQUATIONS = {
 }
 
 
-def _v(m: Motion, equation: str) -> Array:
-    return m.motor_velocity if equation == "motor" else m.joint_velocity
-
-
-def _q(m: Motion, equation: str) -> Array:
-    return m.motor_position if equation != "load" else m.joint_position
-
-
 def residual_maps(problem: Problem, now: Basis) -> list[Map]:
     """Maps of the residual in every equation and variable, largest gain first."""
     found = [
@@ -133,24 +155,15 @@ def _map(problem: Problem, now: Basis, equation: str, variable: str) -> Map:
     knots = _knots(x, variable)
 
     def terms(m: Motion) -> Terms:
-        columns = hats(value(m, equation), knots) * np.reshape(factor(m, equation), (-1, 1))
-        return Terms(**{equation: columns})
+        return Terms(**{equation: hats(value(m, equation), knots) * factor(m, equation)[:, None]})
 
     C = problem.effect_rows(terms)
-    if factor is _TORQUE:
+    if factor is _torque:
         # The torque is what is explained: only how its factor varies is free, not the factor itself.
         weight = hats(x, knots).mean(axis=0)
         C = C - np.outer(C.sum(axis=1), weight)
     gain, values, errors = _explained(C, now)
-    return Map(
-        equation,
-        variable,
-        gain,
-        knots,
-        values,
-        errors,
-        "_times_" not in variable and variable not in {"torsion", "torque"},
-    )
+    return Map(equation, variable, gain, knots, values, errors, plain=factor is _one)
 
 
 def _knots(x: Array, variable: str) -> Array:
@@ -200,14 +213,15 @@ def _line(problem: Problem, now: Basis, equation: str) -> Map:
     return Map(equation, "frequency", gain, np.array([best]), size, errors[:1], True)
 
 
-def _transform(e: Array, t: Array, grid: Array) -> Array:
+def _transform(e: Array, t: Array, grid: Array) -> NDArray[np.complex128]:
+    """Fourier sums of ``e`` at the frequencies of the grid, a few at a time."""
     out = np.zeros(grid.size, dtype=np.complex128)
     for k in range(0, grid.size, 64):
         out[k : k + 64] = np.exp(-2j * np.pi * np.outer(grid[k : k + 64], t)) @ e
     return out
 
 
-def located(fitted: Fitted, found: Map, recording: Recording) -> Where:
+def located(found: Map, recording: Recording) -> Where:
     """Place of a mismatch: equation, variable, and its shape there with 95 % bands."""
     shape = None
     if found.knots.size > 1:
@@ -218,14 +232,15 @@ def located(fitted: Fitted, found: Map, recording: Recording) -> Where:
             found.values,
             found.values - half,
             found.values + half,
-            _unit(found.variable, recording),
+            unit_of_variable(found.variable, recording),
             unit,
         )
     frequency = (float(found.knots[0]), float(found.knots[0])) if found.variable == "frequency" else None
     return Where(found.equation, found.variable, None, frequency, shape)
 
 
-def _unit(variable: str, recording: Recording) -> str:
+def unit_of_variable(variable: str, recording: Recording) -> str:
+    """Unit of the variable of a map."""
     length = "m" if recording.linear else "rad"
     first = variable.split("_times_", maxsplit=1)[0]
     return {"velocity": f"{length}/s", "time": "s", "torque": recording.torque_unit}.get(first, length)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.problem import Problem
-from flexid_cli.diagnose.rows import two_encoder_noise
 
 Array = NDArray[np.float64]
 
@@ -24,16 +23,3 @@ def torque_scale(problem: Problem) -> Mapping[str, float]:
     share = 2.0 * problem.band_hz / s.rate_hz
     names = ("motor", "load") if problem.both else ("motor",)
     return {name: float(np.sqrt(np.mean(density[:, k, k].real) * share)) for k, name in enumerate(names)}
-
-
-def noise_only(problem: Problem) -> Mapping[str, float]:
-    """The same without the floor: encoder and torque noise."""
-    if not problem.both:
-        return torque_scale(problem)
-    s = max(problem.stretches, key=lambda x: x.torque.size)
-    density = two_encoder_noise(problem.base, problem.noise, 2.0 * np.pi * s.taper.frequency_hz)
-    share = 2.0 * problem.band_hz / s.rate_hz
-    return {
-        name: float(np.sqrt(np.mean(density[:, k, k].real) * share))
-        for k, name in enumerate(("motor", "load"))
-    }

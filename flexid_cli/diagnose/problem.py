@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from flexid_cli.pipeline import filters
 from flexid_cli.pipeline.columns import reversal
 from flexid_cli.pipeline.derivatives import differentiate
 from flexid_cli.signals.recording import Segment
+
+if TYPE_CHECKING:
+    from flexid_cli.diagnose.search import Form
 
 Array = NDArray[np.float64]
 Part = Callable[["Stretch", Motion], Sequence["Complex | None"]]
@@ -32,6 +36,7 @@ SHORTEST_S = 2.0
 MODEL_FLOOR = 0.001
 ASTRAY = 1.6
 BOTH_NAMES = ("Jm", "FVm", "FSm", "K", "c", "JL", "FV", "FS", "MX", "MY")
+SHARED = 2  # K and c stand in both equations
 ALONE_NAMES = ("Jm", "FVm", "FSm", "K", "JL", "FV", "FS")
 
 
@@ -48,6 +53,7 @@ class Stretch:
     def __init__(self, segment: Segment, rate_hz: float, band_hz: float) -> None:
         self.rate_hz, self.period_s, self._band = rate_hz, 1.0 / rate_hz, band_hz
         self.torque, self.motor, self.joint = segment.torque, segment.motor_position, segment.joint_position
+        self.segment = segment
         self.start_s = segment.start_s
         self.time_s = segment.start_s + np.arange(segment.samples) * self.period_s
         self.taper = Taper.of(segment.samples, rate_hz, band_hz, MARGIN)
@@ -57,6 +63,10 @@ class Stretch:
         if self.joint is not None:
             self.joint_smooth = self.lowpass(self.joint, SMOOTH_BAND)
             self.joint_sharp = self.derivative(self.lowpass(self.joint, JOINT_SIGN_BAND), 1)
+
+    def with_joint(self, joint: Array) -> Stretch:
+        """The same stretch with another joint position."""
+        return Stretch(replace(self.segment, joint_position=joint), self.rate_hz, self._band)
 
     def lowpass(self, x: Array, over_band: float) -> Array:
         """Zero-phase low pass at a multiple of the rows' band."""
@@ -95,6 +105,8 @@ class Problem:
     gravity, gear_ratio, duration_s : float
     both : bool
         Motor and load equation from both encoders, or eq. (18) from the motor's alone.
+    applied : mapping of Form to ndarray
+        Errors of the joint's position that are taken out of the stretches, with their amplitudes.
     anchor : Base, optional
         What stiffness and inertias may not leave by more than `ASTRAY`: without a joint encoder they take up what
         the model lacks.
@@ -116,6 +128,7 @@ class Problem:
         duration_s: float,
         both: bool,
         shift: float,
+        applied: Mapping[Form, Array] | None = None,
         anchor: Base | None = None,
         settled: bool = True,
     ) -> None:
@@ -123,6 +136,8 @@ class Problem:
         self.gravity, self.gear_ratio, self.duration_s = gravity, gear_ratio, duration_s
         self.both, self.shift, self.anchor = both, shift, anchor
         self.settled = settled
+        self.applied: Mapping[Form, Array] = applied or {}
+        self.recorded = stretches
         self.names = BOTH_NAMES if both else ALONE_NAMES
         self.torque_rms = float(np.sqrt(np.mean(np.concatenate([s.torque for s in stretches]) ** 2)))
         self.weights = [Weights(s.taper, self.spectral(s)) for s in stretches]
@@ -130,14 +145,29 @@ class Problem:
         self.level = float(np.mean([w.level - self._passing(w) for w in self.weights]))
         self.motions = [self._motion(s) for s in stretches]
 
-    def at(self, base: Base, *, shift: float | None = None) -> Problem:
-        """The same record linearised elsewhere."""
-        return Problem(
-            self.stretches, base, self.noise, self.band_hz, gravity=self.gravity, gear_ratio=self.gear_ratio,
-            duration_s=self.duration_s, both=self.both, shift=self.shift if shift is None else shift,
+    def at(
+        self, base: Base, *, shift: float | None = None, applied: Mapping[Form, Array] | None = None
+    ) -> Problem:
+        """The same record linearised elsewhere, with other errors of the joint's position taken out."""
+        stretches = self.stretches
+        if applied is not None and (applied or self.applied):
+            stretches = [_without_errors(s, applied) for s in self.recorded]
+        other = Problem(
+            stretches,
+            base,
+            self.noise,
+            self.band_hz,
+            gravity=self.gravity,
+            gear_ratio=self.gear_ratio,
+            duration_s=self.duration_s,
+            both=self.both,
+            shift=self.shift if shift is None else shift,
+            applied=self.applied if applied is None else applied,
             anchor=self.anchor,
             settled=self.settled,
-        )  # fmt: skip
+        )
+        other.recorded = self.recorded
+        return other
 
     @property
     def row_times(self) -> Array:
@@ -159,6 +189,7 @@ class Problem:
         return float(np.mean(np.log(np.abs(1.0 + (1j * b.FV * omega - b.JL * omega**2) / b.K) ** 2)))
 
     def spectral(self, stretch: Stretch) -> Complex:
+        """Spectral matrix of the equations' noise and of what no model predicts, shape (frequencies, m, m)."""
         omega = 2.0 * np.pi * stretch.taper.frequency_hz
         floor = (MODEL_FLOOR * self.torque_rms) ** 2 * 0.5 * stretch.rate_hz / self.band_hz
         if self.both:
@@ -250,8 +281,17 @@ class Problem:
         motor = [s.derivative(s.motor, 2), s.derivative(s.motor, 1), m.motor_sign, torsion, one]
         load = [-torsion, -one, s.derivative(s.joint, 2), s.derivative(s.joint, 1), m.joint_sign]
         load += [self.gravity * np.cos(m.joint_position), self.gravity * np.sin(m.joint_position)]
+        return self._side_by_side(s, motor, load)
+
+    @staticmethod
+    def _side_by_side(s: Stretch, motor: Sequence[Array], load: Sequence[Array]) -> list[Complex | None]:
+        """Columns of both equations, which share stiffness and zero: the last two of the motor's, the first of the load's."""
         M, L = s.spectrum(np.column_stack(motor)), s.spectrum(np.column_stack(load))
-        return [np.hstack([M, np.zeros((M.shape[0], 5))]), np.hstack([np.zeros((M.shape[0], 3)), L])]
+        own = len(load) - SHARED, len(motor) - SHARED
+        return [
+            np.hstack([M, np.zeros((M.shape[0], own[0]))]),
+            np.hstack([np.zeros((M.shape[0], own[1])), L]),
+        ]
 
     def _base_alone(self, s: Stretch, m: Motion) -> list[Complex | None]:
         b = self.base
@@ -281,8 +321,8 @@ class Problem:
 
         return self._rows(part)[:, 0]
 
-    def noise_rows(self, noisy: Sequence[Stretch]) -> tuple[Array, Array]:
-        """Baseline columns and target of stretches of pure noise, weighted as this record's (both encoders).
+    def noise_rows(self, noisy: Sequence[Stretch]) -> Array:
+        """Baseline columns of stretches of pure noise, weighted as this record's (both encoders).
 
         Signs, gravity and constants are not linear in the noise and stay zero.
         """
@@ -292,13 +332,11 @@ class Problem:
             torsion = s.motor - s.joint
             motor = [s.derivative(s.motor, 2), s.derivative(s.motor, 1), zero, torsion, zero]
             load = [-torsion, zero, s.derivative(s.joint, 2), s.derivative(s.joint, 1), zero, zero, zero]
-            M, L = s.spectrum(np.column_stack(motor)), s.spectrum(np.column_stack(load))
-            return [np.hstack([M, np.zeros((M.shape[0], 5))]), np.hstack([np.zeros((M.shape[0], 3)), L])]
+            return self._side_by_side(s, motor, load)
 
         parts = [w.apply(part(s)) for s, w in zip(noisy, self.weights, strict=True)]
         stacked = np.concatenate(parts, axis=1)
-        columns = stacked.reshape(-1, stacked.shape[-1])
-        return columns, np.zeros(columns.shape[0])
+        return stacked.reshape(-1, stacked.shape[-1])
 
     def effect_rows(self, terms_of: Callable[[Motion], Terms]) -> Array:
         """Rows of what an effect adds, shape (r, k)."""
@@ -418,6 +456,15 @@ def _reversal_step(velocities: Sequence[Array], rate_hz: float, cutoff_hz: float
     found = np.concatenate(slopes) * rate_hz
     reach = 1.0 / (2.0 * np.pi * min(cutoff_hz, HIGHEST_CUTOFF * rate_hz))
     return float(np.median(found) * reach) if found.size else 0.0
+
+
+def _without_errors(s: Stretch, applied: Mapping[Form, Array]) -> Stretch:
+    """The stretch with the joint's position as it was before errors of measurement."""
+    joint = s.joint
+    for form, amplitudes in applied.items():
+        if form.signature.corrected is not None:
+            joint = form.signature.corrected(joint, amplitudes, s.derivative)
+    return s if joint is s.joint else s.with_joint(joint)
 
 
 def _later(s: Stretch, spectrum: Complex, periods: float) -> Complex:

@@ -47,7 +47,7 @@ class Taper:
         window[samples - margin - ramp_samples : samples - margin] = ramp[::-1]
         # The zeros behind the record keep the weighting's reach from wrapping around.
         transform = next_fast_len(samples + round(rate_hz), real=True)
-        frequency = np.fft.rfftfreq(transform, 1.0 / rate_hz)
+        frequency = np.asarray(np.fft.rfftfreq(transform, 1.0 / rate_hz), dtype=np.float64)
         return cls(window, samples, transform, frequency[frequency <= band_hz], rate_hz)
 
     def spectrum(self, x: Array) -> Complex:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -192,19 +192,19 @@ class Search:
         return min(found, key=lambda c: c.rank)
 
 
-def golden(cost: object, low: float, high: float, steps: int) -> float:
+def golden(cost: Callable[[float], float], low: float, high: float, steps: int) -> float:
     """Minimum of a function of one variable by golden section; the best point that was tried."""
     c, d = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-    fc, fd = cost(c), cost(d)  # type: ignore[operator]
+    fc, fd = cost(c), cost(d)
     for _ in range(steps):
         if fc < fd:
             high, d, fd = d, c, fc
             c = high - GOLDEN * (high - low)
-            fc = cost(c)  # type: ignore[operator]
+            fc = cost(c)
         else:
             low, c, fc = c, d, fd
             d = low + GOLDEN * (high - low)
-            fd = cost(d)  # type: ignore[operator]
+            fd = cost(d)
     return float(c if fc < fd else d)
 
 

@@ -16,7 +16,8 @@ NEAR_RIVAL = 0.5  # of the best candidate's gain
 # Least gain (logarithm of the cost) of an effect, and what an alternative may be worse by. Calibrated, see
 # docs/diagnosis.md.
 ENOUGH = 0.15
-AS_GOOD = 0.1
+ENOUGH_ALONE = 0.4  # without a joint encoder
+AS_GOOD = 0.05
 LOOKED_AT = 0.6  # gain that a rival may be behind before its own refit
 
 
@@ -32,8 +33,10 @@ class Selection:
         For each chosen effect, fits of other effects in its place that the record cannot exclude.
     tested : tuple of Candidate
         Every effect against the baseline.
-    rivals : dict
+    rivals : tuple of tuple of (str, float)
         Names of the other effects tried in place of each chosen one, and what they are worse by.
+    left : tuple of Candidate
+        Effects against what the chosen ones leave.
     """
 
     before: Fitted
@@ -44,8 +47,9 @@ class Selection:
     left: tuple[Candidate, ...]
 
 
-def select(fitter: Fitter, problem: Problem, *, enough: float = ENOUGH) -> Selection:
+def select(fitter: Fitter, problem: Problem) -> Selection:
     """Search the library for what the record holds beyond the baseline."""
+    enough = threshold(problem)
     before = fitter.relax(problem)
     fitted, tested = before, fitter.candidates(before)
     found = tested
@@ -57,6 +61,11 @@ def select(fitter: Fitter, problem: Problem, *, enough: float = ENOUGH) -> Selec
         found = fitter.candidates(fitted)
     alternatives, rivals = _alternatives(fitter, fitted)
     return Selection(before, fitted, alternatives, tuple(tested), rivals, tuple(found))
+
+
+def threshold(problem: Problem) -> float:
+    """Least gain that names an effect in this record."""
+    return ENOUGH if problem.both else ENOUGH_ALONE
 
 
 def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted | None:

@@ -91,6 +91,9 @@ class Signature:
         Sign that physics demands of the amplitude; 0: either.
     tied : callable or None
         (amplitudes, shape values, Base) -> why these values cannot be the effect, or an empty string.
+    corrected : callable or None
+        (joint position as recorded, amplitudes, derivative) -> the position that the effect leaves when it is taken
+        out; with it the equations are linearised about the true motion. ``derivative(x, order)``.
     ripple : {"motor", "transmission", ""}
         Equation in which the columns are `forms.sines` of the motor's position with the shape as cycles per
         radian: such a search can be made at once for all cycles.
@@ -106,6 +109,7 @@ class Signature:
     fixed: float | None = None
     sign: int = 0
     tied: Callable[[Array, Sequence[float], Base], str] | None = None
+    corrected: Callable[[Array, Array, Callable[[Array, int], Array]], Array] | None = None
     ripple: str = ""
     needs_joint: bool = False
     motor_alone: bool = False

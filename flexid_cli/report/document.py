@@ -6,7 +6,6 @@ and nowhere else, so that the rest of the report is the same whatever the log wa
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,18 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flexid_cli import __version__
+from flexid_cli.report.diagnosis_section import diagnosis_section
+from flexid_cli.report.parameter import finite, parameter_section
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from flexid_cli.estimate.result import (
-        Estimate,
-        Fit,
-        Identification,
-        Interval,
-        ModelResult,
-        PipelineSummary,
-    )
+    from flexid_cli.diagnose.result import Diagnosis
+    from flexid_cli.estimate.result import Fit, Identification, ModelResult, PipelineSummary
     from flexid_cli.signals.recording import ClockStatistics, Recording
 
 SCHEMA = "flexid-report/1"
@@ -35,12 +30,10 @@ _PAPER = (
     "doi:10.1109/ROBOT.2001.933056"
 )
 CITATIONS = (_PAPER,)
-_NO_ESTIMATE = "the solve gave no finite number"
-_NO_INTERVAL = "the estimate has no finite confidence interval"
-_NO_REASON = "no reason was given"
 # Step of the recording's history that names the clock.
 _CLOCK_STEP = "clock: "
 _DAMAGE_UNKNOWN = "damaged samples were not counted; what the reader met stands under notes"
+_NO_LOG = "a report, not a log"
 _PART_OF_A_RUN = "one of several files of one run: samples and duration of the run stand under recording"
 
 
@@ -88,6 +81,9 @@ class InputFile:
     notes : tuple of str
         What the reader met in this file. The same sentences among the recording's notes are not repeated
         among the report's warnings.
+    role : {"recording", "validation", "parameters"}
+        What the file was used for: the run itself, the other run on which a diagnosis is checked, or the report
+        whose parameters were taken as known.
     """
 
     path: str
@@ -97,31 +93,38 @@ class InputFile:
     duration_s: float | None = None
     damage: Damage | None = None
     notes: tuple[str, ...] = ()
+    role: str = "recording"
 
 
 def build_document(
     *,
-    identification: Identification,
     recording: Recording,
     inputs: Sequence[InputFile],
     config_digest: str,
     config_resolved: Mapping[str, Any],
+    identification: Identification | None = None,
+    diagnosis: Diagnosis | None = None,
+    validation: Recording | None = None,
     citations: Sequence[str] = CITATIONS,
 ) -> dict[str, Any]:
-    """Build the report of an identification.
+    """Build the report of an identification or of a diagnosis.
 
     Parameters
     ----------
-    identification : Identification
-        What was estimated.
     recording : Recording
         What it was estimated from.
     inputs : sequence of InputFile
-        The files of the run, in their order.
+        The files of the run, in their order; after them those of other roles.
     config_digest : str
         SHA-256 of the configuration file.
     config_resolved : mapping
         The configuration with all defaults filled in.
+    identification : Identification, optional
+        What was estimated.
+    diagnosis : Diagnosis, optional
+        Where simulation and recording differ, and why.
+    validation : Recording, optional
+        The other run, whose files are the inputs of that role.
     citations : sequence of str
         References for the methods that were used.
 
@@ -137,16 +140,18 @@ def build_document(
     TypeError
         A result holds something that is not plain data.
     """
+    models = () if identification is None else identification.models
+    skipped = () if identification is None else identification.skipped
     document = {
         "schema": SCHEMA,
         "tool": {"name": "flexid", "version": __version__},
-        "inputs": [_input(file, recording, single=len(inputs) == 1) for file in inputs],
+        "inputs": _inputs(inputs, recording, validation),
         "config": {"sha256": config_digest, "resolved": config_resolved},
         "recording": _recording(recording),
-        "models": [_model(model) for model in identification.models],
-        "skipped": [{"id": model.id, "reason": model.reason} for model in identification.skipped],
-        "diagnosis": None,
-        "warnings": _warnings(identification, recording, inputs),
+        "models": [_model(model) for model in models],
+        "skipped": [{"id": model.id, "reason": model.reason} for model in skipped],
+        "diagnosis": None if diagnosis is None else diagnosis_section(diagnosis),
+        "warnings": _warnings(identification, (recording, validation), inputs),
         "citations": list(citations),
     }
     plain = _plain(document)
@@ -155,43 +160,61 @@ def build_document(
     return plain
 
 
-def _warnings(identification: Identification, recording: Recording, inputs: Sequence[InputFile]) -> list[str]:
+def _warnings(
+    identification: Identification | None,
+    recordings: Sequence[Recording | None],
+    inputs: Sequence[InputFile],
+) -> list[str]:
     """Return every warning once; what a reader said of its file stands under that input alone."""
     told = {note for file in inputs for note in file.notes}
-    warnings = dict.fromkeys([*identification.warnings, *recording.notes])
+    notes = [note for recording in recordings if recording is not None for note in recording.notes]
+    warnings = dict.fromkeys([*(() if identification is None else identification.warnings), *notes])
     return [warning for warning in warnings if warning not in told]
 
 
-def _input(file: InputFile, recording: Recording, *, single: bool) -> dict[str, Any]:
-    clock = _leading_clock(recording.clocks)
+def _inputs(
+    inputs: Sequence[InputFile], recording: Recording, validation: Recording | None
+) -> list[dict[str, Any]]:
+    """Return the files of every role, each with the totals of the recording that it belongs to."""
+    roles = [file.role for file in inputs]
+    recordings = {"recording": recording, "validation": validation}
+    return [_input(f, recordings.get(f.role), single=roles.count(f.role) == 1) for f in inputs]
+
+
+def _input(file: InputFile, recording: Recording | None, *, single: bool) -> dict[str, Any]:
+    clock = None if recording is None else _leading_clock(recording.clocks)
     samples, duration_s, notes = file.samples, file.duration_s, file.notes
-    if single:
+    if single and recording is not None:
         samples = clock.samples if samples is None and clock is not None else samples
         duration_s = recording.duration_s if duration_s is None else duration_s
-    elif samples is None or duration_s is None:
+    elif recording is not None and (samples is None or duration_s is None):
         notes = (*notes, _PART_OF_A_RUN)
-    damage = file.damage
+    reason = "" if recording is None else _clock_reason(recording, "" if clock is None else clock.clock)
+    unknown = _NO_LOG if recording is None else _DAMAGE_UNKNOWN
     return {
         "path": file.path,
+        "role": file.role,
         "sha256": file.sha256,
         "format": file.format,
         "clock": None if clock is None else clock.clock,
-        "clock_reason": _clock_reason(recording, "" if clock is None else clock.clock),
+        "clock_reason": reason,
         "samples": samples,
         "duration": duration_s,
-        "damage": None
-        if damage is None
-        else {
-            "trusted": damage.trusted,
-            "suspect": damage.suspect,
-            "lost": damage.lost,
-            "lost_bytes": damage.lost_bytes,
-            "lost_chunks": damage.lost_chunks,
-            "spans_s": damage.spans_s,
-            "reasons": damage.reasons,
-        },
-        "damage_reason": _DAMAGE_UNKNOWN if damage is None else "",
+        "damage": None if file.damage is None else _damage(file.damage),
+        "damage_reason": unknown if file.damage is None else "",
         "notes": notes,
+    }
+
+
+def _damage(damage: Damage) -> dict[str, Any]:
+    return {
+        "trusted": damage.trusted,
+        "suspect": damage.suspect,
+        "lost": damage.lost,
+        "lost_bytes": damage.lost_bytes,
+        "lost_chunks": damage.lost_chunks,
+        "spans_s": damage.spans_s,
+        "reasons": damage.reasons,
     }
 
 
@@ -247,9 +270,9 @@ def _model(model: ModelResult) -> dict[str, Any]:
         "method_reason": model.method_reason,
         "equation": model.equation,
         "added_terms": model.added_terms,
-        "parameters": [_parameter(estimate) for estimate in model.parameters],
-        "regression": [_parameter(estimate) for estimate in model.regression],
-        "derived": [_parameter(estimate) for estimate in model.derived],
+        "parameters": [parameter_section(estimate) for estimate in model.parameters],
+        "regression": [parameter_section(estimate) for estimate in model.regression],
+        "derived": [parameter_section(estimate) for estimate in model.derived],
         "correlation": {"names": model.correlation_names, "matrix": _matrix(model.correlation)},
         "condition_number": model.condition_number,
         "rank": model.rank,
@@ -261,50 +284,8 @@ def _model(model: ModelResult) -> dict[str, Any]:
     }
 
 
-def _parameter(estimate: Estimate) -> dict[str, Any]:
-    value, stderr = _finite(estimate.value), _finite(estimate.stderr)
-    ci = _interval(estimate.interval)
-    verdict, reason = _verdict(estimate, value, stderr, ci)
-    has_value = value is not None
-    return {
-        "name": estimate.name,
-        "symbol": estimate.symbol,
-        "unit": estimate.unit,
-        "estimate": value,
-        "stderr": stderr if has_value else None,
-        "ci": ci if has_value else None,
-        "relative_stderr_percent": _finite(estimate.relative_stderr_percent) if has_value else None,
-        "verdict": verdict,
-        "reason": reason,
-    }
-
-
-def _verdict(
-    estimate: Estimate, value: float | None, stderr: float | None, ci: dict[str, Any] | None
-) -> tuple[str, str]:
-    """Return verdict and reason, never better than what the numbers themselves allow."""
-    if value is None:
-        return "not_identifiable", estimate.reason or _NO_ESTIMATE
-    if estimate.verdict == "identified":
-        bounded = ci is not None and ci["low"] is not None and ci["high"] is not None
-        if stderr is None or not bounded:
-            return "weak", estimate.reason or _NO_INTERVAL
-        return "identified", estimate.reason
-    return estimate.verdict, estimate.reason or _NO_REASON
-
-
-def _interval(interval: Interval | None) -> dict[str, Any] | None:
-    """Return the interval; a bound that is not finite is None, and no interval is left without any bound."""
-    if interval is None:
-        return None
-    low, high = _finite(interval.low), _finite(interval.high)
-    if low is None and high is None:
-        return None
-    return {"low": low, "high": high, "level": interval.level, "method": interval.method}
-
-
 def _matrix(matrix: NDArray[np.float64]) -> list[list[float | None]]:
-    return [[_finite(float(cell)) for cell in row] for row in np.atleast_2d(matrix)] if matrix.size else []
+    return [[finite(float(cell)) for cell in row] for row in np.atleast_2d(matrix)] if matrix.size else []
 
 
 def _fit(fit: Fit) -> dict[str, Any]:
@@ -336,17 +317,13 @@ def _pipeline(pipeline: PipelineSummary) -> dict[str, Any]:
     }
 
 
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
 def _plain(value: Any) -> Any:
     """Turn what results hold into data that JSON can hold."""
     match value:
         case None | bool() | int():
             return value
         case float():
-            return _finite(value)
+            return finite(value)
         case str():
             return _writable(value)
         case Mapping():

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from flexid_cli.report.diagnosis_words import RESIDUAL_FIGURE, SHAPE_FIGURE, labelled, map_key, phrase
 from flexid_cli.report.numbers import format_significant
 from flexid_cli.report.words import quantity
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
+    from flexid_cli.diagnose.result import Diagnosis, ResidualMap, Traces, Where
     from flexid_cli.estimate.result import ModelResult, PipelineSummary
 
     Array = NDArray[np.float64]
@@ -122,6 +124,83 @@ def figure_spectrum(model: ModelResult) -> str:
         _legend(axes, columns=3)
 
     return _svg(draw, f"Amplitude spectrum of the motor {quantity(model.trace.unit)}, model {model.id}", 3.9)
+
+
+def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, str]:
+    """Return every figure of a diagnosis as SVG text, by the keys of `diagnosis_words.captions`."""
+    figures: dict[str, str] = {}
+    if diagnosis.traces is not None and diagnosis.traces.before:
+        figures[RESIDUAL_FIGURE] = figure_residual(diagnosis.traces)
+    for k, one in enumerate(diagnosis.maps):
+        figures[map_key(k)] = figure_map(one)
+    if diagnosis.location is not None and diagnosis.location.shape is not None:
+        figures[SHAPE_FIGURE] = figure_shape(diagnosis.location)
+    return figures
+
+
+def figure_residual(traces: Traces) -> str:
+    """Draw the residual of each equation over time, before and after; the same scale for both.
+
+    Where nothing changed there is one line.
+    """
+    changed = any(not np.array_equal(a, traces.after.get(e, a)) for e, a in traces.before.items())
+
+    def draw(figure: Figure) -> None:
+        rows = figure.subplots(len(traces.before), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, (equation, before) in zip(rows, traces.before.items(), strict=True):
+            if changed:
+                # Light, or what is left would hide behind what was there.
+                _line(axes, traces.time_s, before, color=_UNDERNEATH, linewidth=1.4, label="before")
+            after = traces.after.get(equation, before)
+            label = "after" if changed else "residual"
+            _line(axes, traces.time_s, after, color=_RESIDUAL, linewidth=0.9, label=label)
+            axes.set_ylabel(f"{phrase(equation)} ({traces.unit})")
+            axes.margins(x=0.01)
+        rows[-1].set_xlabel("time (s)")
+        _legend(rows[0], columns=2)
+
+    title = f"Residual of each equation{' before and after' if changed else ''}"
+    return _svg(draw, title, 1.6 + 1.9 * len(traces.before))
+
+
+def figure_map(one: ResidualMap) -> str:
+    """Draw the mean residual over a variable, before and after, about the band in which it is no residual."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        label = "95 % band of no difference"
+        axes.fill_between(one.x, -one.band, one.band, color=_BAND, alpha=0.3, linewidth=0.0, label=label)
+        axes.axhline(0.0, color=_MEASURED, linewidth=0.6)
+        axes.plot(
+            one.x, one.before, color=_PREDICTED, marker="o", markersize=3.5, linewidth=1.2, label="before"
+        )
+        axes.plot(one.x, one.after, color=_RESIDUAL, marker="s", markersize=3.5, linewidth=1.2, label="after")
+        axes.set_xlabel(labelled(phrase(one.variable), one.x_unit))
+        axes.set_ylabel(f"mean residual ({one.unit})")
+        _legend(axes, columns=3)
+
+    title = f"Residual of the {phrase(one.equation)} equation over {phrase(one.variable)}"
+    return _svg(draw, title, 3.9)
+
+
+def figure_shape(where: Where) -> str:
+    """Draw what stays unexplained over the variable that it was located in, with its band."""
+    shape = where.shape
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        if shape is None:
+            return
+        axes.fill_between(
+            shape.x, shape.low, shape.high, color=_BAND, alpha=0.3, linewidth=0.0, label="95 % band"
+        )
+        axes.axhline(0.0, color=_MEASURED, linewidth=0.6)
+        axes.plot(shape.x, shape.y, color=_PREDICTED, marker="o", markersize=3.5, linewidth=1.2, label="mean")
+        axes.set_xlabel(labelled(phrase(where.variable), shape.x_unit))
+        axes.set_ylabel(f"unexplained ({shape.unit})")
+        _legend(axes, columns=2)
+
+    return _svg(draw, f"What stays unexplained, {phrase(where.equation)} equation", 3.9)
 
 
 def _svg(draw: Any, title: str, height_in: float) -> str:

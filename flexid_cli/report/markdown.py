@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-import re
 from typing import TYPE_CHECKING, Any
 
 from flexid_cli.report import words
+from flexid_cli.report.diagnosis_markdown import diagnosis_blocks
+from flexid_cli.report.markdown_text import bullets, code, escape, estimates, numbered, table
 from flexid_cli.report.numbers import MISSING, format_significant
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
 FIGURE_KINDS = ("torque", "filter", "spectrum")
+_ROLES = {"recording": "Input", "validation": "Other run", "parameters": "Known parameters"}
 _SMALLEST_P_VALUE = 0.001
 _CLOCK_COUNTS = ("gaps", "bridged", "duplicates", "reordered", "resets", "invalid")
-_SPECIAL = re.compile(r"[\\`*\[\]<>|~^$&#]|(?<![^\W_])_|_(?![^\W_])|^[-+=]")
-_LIST_NUMBER = re.compile(r"^(\d+)([.)])(?=\s|$)")
 
 
 def render_markdown(document: Mapping[str, Any], figures: Mapping[str, str]) -> str:
@@ -27,23 +27,19 @@ def render_markdown(document: Mapping[str, Any], figures: Mapping[str, str]) -> 
     document : mapping
         From `build_document`.
     figures : mapping of str to str
-        Link of each figure by ``<model>_<kind>`` (``two_encoders_torque``), relative to the Markdown file. A
-        figure without a link is left out.
+        Link of each figure by ``<model>_<kind>`` (``two_encoders_torque``) or by the keys of
+        `diagnosis_words.captions`, relative to the Markdown file. A figure without a link is left out.
     """
-    models = document["models"]
-    blocks = [f"# Drive parameters of {escape(words.axis_name(document))}", *_verdict(document)]
+    models, axis = document["models"], escape(words.axis_name(document))
+    if document["diagnosis"] is None:
+        blocks = [f"# Drive parameters of {axis}", *_verdict(document)]
+    else:
+        blocks = [f"# Diagnosis of {axis}", *diagnosis_blocks(document, figures)]
     for model in models:
         blocks += [f"## Model {model['id']}", *_results(model), *_figures(model, figures)]
     blocks += [*_warnings(document), *_data_quality(document)]
     blocks += [*_pipelines(models), *_methods(models), *_reproducibility(document)]
     return "\n\n".join(blocks) + "\n"
-
-
-def escape(text: str) -> str:
-    """Escape what Markdown, GitHub's tables and mathematics, or pandoc's extensions would interpret."""
-    one_line = " ".join(str(text).split())
-    escaped = _SPECIAL.sub(lambda match: "\\" + match.group(0), one_line)
-    return _LIST_NUMBER.sub(r"\1\\\2", escaped)
 
 
 def _verdict(document: Mapping[str, Any]) -> list[str]:
@@ -53,40 +49,27 @@ def _verdict(document: Mapping[str, Any]) -> list[str]:
         lines = ["No model was solved."]
     legend = "; ".join(f"*{words.VERDICTS[key]}*: {text}" for key, text in words.EXPLANATIONS.items())
     side = words.side_sentence(document)
-    return ["## Verdict", _bullets(lines), f"Here {legend}.", *([escape(side)] if side else [])]
+    return ["## Verdict", bullets(lines), f"Here {legend}.", *([escape(side)] if side else [])]
 
 
 def _results(model: Mapping[str, Any]) -> list[str]:
-    blocks = ["### Parameters", *_estimates(model["parameters"])]
+    blocks = ["### Parameters", estimates(model["parameters"])]
     reasons = words.reasons([*model["parameters"], *model["regression"], *model["derived"]])
     if reasons:
         lines = [f"**{escape(name)}** ({verdict}): {escape(reason)}" for name, verdict, reason in reasons]
-        blocks += ["### Reasons", _bullets(lines)]
+        blocks += ["### Reasons", bullets(lines)]
     if model["regression"]:
-        blocks += ["### Regression", *_estimates(model["regression"])]
+        blocks += ["### Regression", estimates(model["regression"])]
     if model["derived"]:
-        blocks += ["### Derived quantities", *_estimates(model["derived"])]
+        blocks += ["### Derived quantities", estimates(model["derived"])]
     return [*blocks, "### Fit", escape(words.fit_sentence(model)), *_tests(model), *_correlations(model)]
-
-
-def _estimates(parameters: Sequence[Mapping[str, Any]]) -> list[str]:
-    header = words.interval_header(parameters)
-    interval_title = header[0].upper() + header[1:]
-    titles = ("Symbol", "Name", "Estimate", interval_title, "Unit", "Rel. std. dev. %", "Verdict")
-    rows = []
-    for parameter in parameters:
-        estimate, interval, relative = words.estimate_cells(parameter, with_level=header == "interval")
-        verdict = words.VERDICTS[parameter["verdict"]]
-        symbol, unit = escape(parameter["symbol"]), escape(words.unit_cell(parameter))
-        rows.append((symbol, escape(parameter["name"]), estimate, interval, unit, relative, verdict))
-    return [_table(titles, "llrrlrl", rows)]
 
 
 def _tests(model: Mapping[str, Any]) -> list[str]:
     if not model["tests"]:
         return []
     lines = [f"{escape(_phrase(name))}: {escape(_facts(test))}" for name, test in model["tests"].items()]
-    return ["Tests of the result:", _bullets(lines)]
+    return ["Tests of the result:", bullets(lines)]
 
 
 def _facts(test: Mapping[str, Any]) -> str:
@@ -121,7 +104,7 @@ def _correlations(model: Mapping[str, Any]) -> list[str]:
     if not pairs:
         return []
     lines = [f"{escape(a)} and {escape(b)}: {format_significant(value, 3)}" for a, b, value in pairs]
-    return ["Estimates that this record hardly tells apart (correlation):", _bullets(lines)]
+    return ["Estimates that this record hardly tells apart (correlation):", bullets(lines)]
 
 
 def _figures(model: Mapping[str, Any], figures: Mapping[str, str]) -> list[str]:
@@ -134,7 +117,7 @@ def _warnings(document: Mapping[str, Any]) -> list[str]:
     lines = [escape(warning) for warning in document["warnings"]]
     for model in document["models"]:
         lines += [escape(warning) for warning in words.model_warnings(model)]
-    return ["## Warnings", _bullets(lines)] if lines else []
+    return ["## Warnings", bullets(lines)] if lines else []
 
 
 def _data_quality(document: Mapping[str, Any]) -> list[str]:
@@ -150,9 +133,9 @@ def _data_quality(document: Mapping[str, Any]) -> list[str]:
         counts = (key.capitalize() for key in _CLOCK_COUNTS)
         titles = ("Signal", "Samples", "Period", "Jitter", "Lost", *counts)
         rows = [_clock_row(clock) for clock in recording["clocks"]]
-        blocks += [_table(titles, "lrrrr" + "r" * len(_CLOCK_COUNTS), rows), _clock_legend()]
+        blocks += [table(titles, "lrrrr" + "r" * len(_CLOCK_COUNTS), rows), _clock_legend()]
     notes = [line for entry in document["inputs"] for line in _input_notes(entry)]
-    return [*blocks, _bullets(notes)] if notes else blocks
+    return [*blocks, bullets(notes)] if notes else blocks
 
 
 def _input_notes(entry: Mapping[str, Any]) -> list[str]:
@@ -183,7 +166,7 @@ def _pipelines(models: Sequence[Mapping[str, Any]]) -> list[str]:
     for model in models:
         steps = [escape(step) for step in model["pipeline"]["steps"]]
         sentences = (words.band_sentence(model), words.resonance_sentence(model), _rows(model["pipeline"]))
-        blocks += [f"### {escape(model['id'])}: pipeline", *([_numbered(steps)] if steps else [])]
+        blocks += [f"### {escape(model['id'])}: pipeline", *([numbered(steps)] if steps else [])]
         blocks.append(escape(" ".join(sentence for sentence in sentences if sentence)))
     return blocks
 
@@ -198,8 +181,8 @@ def _rows(pipeline: Mapping[str, Any]) -> str:
 def _methods(models: Sequence[Mapping[str, Any]]) -> list[str]:
     blocks = ["## Method"] if models else []
     for model in models:
-        blocks += [f"### {escape(model['id'])}: method", _code(model["equation"])]
-        blocks.append(_bullets(_method_lines(model)))
+        blocks += [f"### {escape(model['id'])}: method", code(model["equation"])]
+        blocks.append(bullets(_method_lines(model)))
     return blocks
 
 
@@ -222,12 +205,12 @@ def _reproducibility(document: Mapping[str, Any]) -> list[str]:
     lines = [f"{tool['name']} {tool['version']}, report format {document['schema']}"]
     lines += [_input_line(entry) for entry in document["inputs"]]
     lines.append(f"Configuration: SHA-256 `{config['sha256']}`")
-    blocks = ["## Reproducibility", _bullets(lines)]
+    blocks = ["## Reproducibility", bullets(lines)]
     if config["resolved"]:
         settings = "\n".join(_settings(config["resolved"]))
-        blocks += ["The configuration with all defaults filled in:", _code(settings)]
+        blocks += ["The configuration with all defaults filled in:", code(settings)]
     if document["citations"]:
-        blocks += ["## References", _bullets(escape(citation) for citation in document["citations"])]
+        blocks += ["## References", bullets(escape(citation) for citation in document["citations"])]
     return blocks
 
 
@@ -240,7 +223,8 @@ def _input_line(entry: Mapping[str, Any]) -> str:
         facts.append(f"{entry['samples']} samples")
     if entry["duration"] is not None:
         facts.append(words.duration(entry["duration"]))
-    return f"Input {escape(entry['path'])} ({escape(', '.join(facts))}): SHA-256 `{entry['sha256']}`"
+    file = f"{_ROLES[entry['role']]} {escape(entry['path'])}"
+    return f"{file} ({escape(', '.join(facts))}): SHA-256 `{entry['sha256']}`"
 
 
 def _settings(value: object, path: str = "") -> Iterable[str]:
@@ -250,25 +234,3 @@ def _settings(value: object, path: str = "") -> Iterable[str]:
             yield from _settings(item, f"{path}.{key}" if path else str(key))
     else:
         yield f"{path} = {json.dumps(value, ensure_ascii=False)}"
-
-
-def _table(titles: Sequence[str], alignment: str, rows: Sequence[Sequence[str]]) -> str:
-    """Pipe table; ``alignment`` has l or r for each column. Cells are escaped by the caller."""
-    rules = ["---:" if side == "r" else ":---" for side in alignment]
-    lines = [titles, rules, *([cell or MISSING for cell in row] for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _bullets(lines: Iterable[str]) -> str:
-    return "\n".join(f"- {line}" for line in lines)
-
-
-def _numbered(lines: Iterable[str]) -> str:
-    return "\n".join(f"{number}. {line}" for number, line in enumerate(lines, start=1))
-
-
-def _code(text: str) -> str:
-    """Fenced block whose fence is longer than any run of backticks in the text."""
-    longest = max((len(run) for run in re.findall(r"`+", text)), default=0)
-    fence = "`" * max(3, longest + 1)
-    return f"{fence}text\n{text}\n{fence}"

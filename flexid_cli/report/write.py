@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from flexid_cli.diagnose.result import Diagnosis
     from flexid_cli.estimate.result import Identification
 
 SUFFIXES = (".json", ".md")
@@ -43,17 +44,18 @@ def check_formats(outputs: Sequence[Path]) -> None:
 
 
 def render_outputs(
-    document: Mapping[str, Any], identification: Identification, outputs: Sequence[Path]
+    document: Mapping[str, Any], result: Identification | Diagnosis, outputs: Sequence[Path]
 ) -> dict[Path, str]:
     """Render each output in the format that its suffix names.
 
-    The figures of a Markdown report are files beside it, ``<stem>_<model>_<kind>.svg``, with relative links.
+    The figures of a Markdown report are files beside it, ``<stem>_<model>_<kind>.svg`` or
+    ``<stem>_diagnosis_<kind>.svg``, with relative links.
 
     Parameters
     ----------
     document : mapping
         From `build_document`.
-    identification : Identification
+    result : Identification or Diagnosis
         Where the figures' curves come from.
     outputs : sequence of Path
         Files to make. Nothing is written here.
@@ -70,7 +72,7 @@ def render_outputs(
     """
     check_formats(outputs)
     contents: dict[Path, str] = {}
-    figures = _figures(identification) if any(_is_markdown(path) for path in outputs) else {}
+    figures = _figures(result) if any(_is_markdown(path) for path in outputs) else {}
     for path in outputs:
         if _is_markdown(path):
             files = {key: path.with_name(f"{path.stem}_{key}.svg") for key in figures}
@@ -86,9 +88,12 @@ def _is_markdown(path: Path) -> bool:
     return path.suffix.lower() == ".md"
 
 
-def _figures(identification: Identification) -> dict[str, str]:
+def _figures(result: Identification | Diagnosis) -> dict[str, str]:
     """Every figure by the key that `render_markdown` expects; each is drawn once."""
-    from flexid_cli.report.figures import model_figures
+    from flexid_cli.diagnose.result import Diagnosis
+    from flexid_cli.report.figures import diagnosis_figures, model_figures
 
-    drawn = {model.id: model_figures(model) for model in identification.models}
+    if isinstance(result, Diagnosis):
+        return diagnosis_figures(result)
+    drawn = {model.id: model_figures(model) for model in result.models}
     return {f"{id_}_{kind}": figures[kind] for id_, figures in drawn.items() for kind in FIGURE_KINDS}

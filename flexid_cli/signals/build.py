@@ -124,12 +124,13 @@ def recording_from_raw(raw: RawLog, config: Config, time: RawChannel | None = No
     clock = _choose(raw, channels, config, time)
     timelines = _clean(clock, _max_gap(config))
     timelines = {role: broken(timeline, channels[role], raw) for role, timeline in timelines.items()}
-    signals = _convert_all(channels, sources, timelines, clock.name, config)
+    signals, origin_ns = _convert_all(channels, sources, timelines, clock.name, config)
     for signal in signals.values():
         _require_motion(signal)
     history = [f"clock: {clock.name} ({clock.reason})", *_describe_signals(signals)]
     signals = {role: _delayed(role, signal, config, history) for role, signal in signals.items()}
     segments, rate, notes, duration = _align(signals, config, history)
+    start_ns = origin_ns + min(int(signal.track.stamps[0]) for signal in signals.values())
     notes += _check_motions(segments, config)
     return Recording(
         sample_rate_hz=rate,
@@ -137,6 +138,7 @@ def recording_from_raw(raw: RawLog, config: Config, time: RawChannel | None = No
         linear=config.linear,
         torque_unit=signals[config.signals.torque_role].converted.unit,
         duration_s=duration,
+        start_ns=start_ns,
         clocks=tuple(signal.track.statistics for signal in signals.values()),
         history=tuple(history),
         notes=(
@@ -463,7 +465,8 @@ def _convert_all(
     timelines: Mapping[str, Timeline],
     clock: str,
     config: Config,
-) -> dict[str, _Signal]:
+) -> tuple[dict[str, _Signal], int]:
+    """Signals on stamps that count from the earliest of them, which is returned too."""
     tracks = {
         role: make_track(role, sources[role], clock, timelines[role], channel.values, _max_gap(config))
         for role, channel in channels.items()
@@ -474,7 +477,7 @@ def _convert_all(
         converted = _convert(role, track, config)
         moved = replace(track, stamps=track.stamps - origin, values=converted.values)
         signals[role] = _Signal(moved, converted, sources[role])
-    return signals
+    return signals, origin
 
 
 def _convert(role: str, track: Track, config: Config) -> Converted:

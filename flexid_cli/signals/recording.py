@@ -90,6 +90,9 @@ class Recording:
         ``N.m``, ``N`` or ``A`` (torque constant unknown).
     duration_s : float
         From first to last sample, gaps included.
+    start_ns : int
+        Stamp of the log at which its segments' times are zero, ns; apart from this nothing depends on when it was
+        recorded.
     clocks : tuple of ClockStatistics
         One per signal.
     history : tuple of str
@@ -103,6 +106,7 @@ class Recording:
     linear: bool = False
     torque_unit: str = "N.m"
     duration_s: float = 0.0
+    start_ns: int = field(default=0, compare=False)
     clocks: tuple[ClockStatistics, ...] = ()
     history: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default_factory=tuple)

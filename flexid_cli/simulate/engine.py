@@ -84,12 +84,12 @@ def simulate_closed_loop(
     at = np.arange(controls.max() + 1) * period
     grid = np.arange(reference.size) / rate_hz
     wanted = reference if controller.period_s is None else np.interp(at, grid, reference)
+    history = (0.0, 0.0) if initial is None else (initial.integral, initial.reference_velocity)
     gains = np.array(
-        [controller.kp, controller.kv, controller.ki, controller.velocity_feedforward, period, 0.0]
+        [controller.kp, controller.kv, controller.ki, controller.velocity_feedforward, period, *history]
     )
-    gains[5] = 0.0 if initial is None else initial.integral
     plan = _Plan(times, controls, rows, np.empty((0, 6)), gains, wanted)
-    start = initial or InitialState(float(reference[0]), _rest_position(axis, float(reference[0])))
+    start = initial or InitialState(float(reference[0]), rest_position(axis, float(reference[0])))
     return _simulate(
         axis, plan, rate_hz, effects, sensors or Sensors(), seed, start, initial is None, solver, reference
     )
@@ -133,7 +133,7 @@ def simulate_torque_driven(
     if hold == "linear":
         inputs[:-1, 1] = np.diff(torque) * _rate(rate_hz)
     plan = _record_plan(inputs, rate_hz)
-    start = initial or InitialState(0.0, _rest_position(axis, 0.0))
+    start = initial or InitialState(0.0, rest_position(axis, 0.0))
     return _simulate(
         axis, plan, rate_hz, effects, sensors or Sensors(), seed, start, initial is None, solver, None
     )
@@ -175,7 +175,7 @@ def simulate_motor_driven(
     inputs = _spline(motor_position, _rate(rate_hz))
     plan = _record_plan(inputs, rate_hz)
     first, speed = float(inputs[0, 0]), float(inputs[0, 1])
-    start = initial or InitialState(first, _rest_position(axis, first), speed, speed)
+    start = initial or InitialState(first, rest_position(axis, first), speed, speed)
     return _simulate(
         axis,
         plan,
@@ -221,7 +221,7 @@ def _rate(rate_hz: float) -> float:
 def _record_plan(inputs: Array, rate_hz: float) -> _Plan:
     n = inputs.shape[0]
     index = np.arange(n, dtype=np.int64)
-    return _Plan(index / _rate(rate_hz), np.full(n, -1), index, inputs, np.zeros(6), np.zeros(1))
+    return _Plan(index / _rate(rate_hz), np.full(n, -1), index, inputs, np.zeros(7), np.zeros(1))
 
 
 def _breakpoints(n: int, record_s: float, control_s: float) -> tuple[Array, Index, Index]:
@@ -255,7 +255,7 @@ def _spline(values: Array, rate_hz: float) -> Array:
     return out
 
 
-def _rest_position(axis: Axis, motor_position: float) -> float:
+def rest_position(axis: Axis, motor_position: float) -> float:
     """Joint position where the spring carries the weight (the kernel adds what effects change)."""
     position = motor_position
     for _ in range(50):
@@ -395,7 +395,7 @@ def _held_late(torque: Array, delay_samples: float) -> Array:
 def _joint_measured(out: Array, rate_hz: float, sensors: Sensors, noise: Array) -> Array:
     """Joint position as it is recorded: late, off its zero, noisy, in counts."""
     delay = (out[kernel.JOINT_DELAY] + sensors.joint_delay_s) * rate_hz
-    position = out[kernel.MEASURED_JOINT].copy()
+    position: Array = out[kernel.MEASURED_JOINT].copy()
     if np.any(delay != 0.0):
         position = _shifted(position, out[kernel.MEASURED_JOINT_RATE] / rate_hz, delay)
     if sensors.joint_zero != 0.0:

@@ -455,8 +455,8 @@ def run(  # type: ignore[no-untyped-def] # pragma: no cover
     inputs
         Polynomials of the input, shape (breakpoints, 6); without rows: closed loop.
     gains, reference
-        kp, kv, ki, velocity feed-forward, period, integral at the start; and the reference at the controller's
-        instants.
+        kp, kv, ki, velocity feed-forward, period, and at the start integral and velocity of the reference; the
+        reference at the controller's instants.
     motor_sensor, motor_noise
         Resolution and delay; noise at each breakpoint.
     control
@@ -509,7 +509,8 @@ def run(  # type: ignore[no-untyped-def] # pragma: no cover
         if closed and controls[b] >= 0:
             wanted = reference[controls[b]]
             if controls[b] == 0:
-                before, before_reference = measured, wanted
+                # Moving at the start, it did so before.
+                before, before_reference = measured - x[2] * gains[4], wanted - gains[6] * gains[4]
             period = gains[4]
             error = gains[0] * (wanted - measured) + gains[3] * (wanted - before_reference) / period
             error -= (measured - before) / period

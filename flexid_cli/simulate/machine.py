@@ -147,7 +147,7 @@ class InitialState:
     """Where the simulation starts; what is not given is at rest, the spring carrying the load.
 
     ``integral`` is that of the controller's velocity error, rad: a loop that was on before the record began holds
-    weight and friction with it.
+    weight and friction with it. Its differences begin with motor and reference moving at the given velocities.
     """
 
     motor_position: float
@@ -155,6 +155,7 @@ class InitialState:
     motor_velocity: float = 0.0
     joint_velocity: float = 0.0
     integral: float = 0.0
+    reference_velocity: float = 0.0
 
 
 @dataclass(frozen=True)

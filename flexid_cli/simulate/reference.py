@@ -39,7 +39,7 @@ class Motion:
     amplitude : float
         Largest distance from the centre, rad (m).
     start_hz, stop_hz : float
-        Frequencies: of the chirp's ends, of the multisine's band, of updown's slowest and fastest period. `slow` has none.
+        Ends of the chirp, of the multisine's band; slowest and fastest period of updown. `slow` has none.
     centre : float
         Where it starts and ends.
     """

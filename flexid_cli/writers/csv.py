@@ -33,6 +33,7 @@ def write_csv(
     delimiter: str = ",",
     decimal: Literal[".", ","] = ".",
     encoding: str = "utf-8",
+    rows_before: int = 0,
     overwrite: bool = False,
 ) -> None:
     """Write a table as CSV; a name that ends in ``.gz`` or ``.zst`` is packed.
@@ -58,6 +59,8 @@ def write_csv(
         Whether the first row holds the names.
     delimiter, decimal, encoding : str
         Column separator, decimal sign, text encoding.
+    rows_before : int
+        Rows that say nothing, before the header, for readers that skip as many.
     overwrite : bool
         Whether an existing file is replaced.
 
@@ -82,7 +85,9 @@ def write_csv(
     with finished_later(path, overwrite=overwrite) as draft:
         pack = _packer(path)
         with draft.open("wb") as stream:
-            blocks = _blocks(table.stamps_ns.size, titles if header else None, columns, delimiter)
+            blocks = _blocks(
+                table.stamps_ns.size, [["-"]] * rows_before + [titles] * header, columns, delimiter
+            )
             for block in pack(_encoded(blocks, encoding)):
                 stream.write(block)
 
@@ -101,13 +106,13 @@ def _texts(
 
 
 def _blocks(
-    count: int, titles: list[str] | None, columns: list[Callable[[slice], list[str]]], delimiter: str
+    count: int, first: list[list[str]], columns: list[Callable[[slice], list[str]]], delimiter: str
 ) -> Iterator[str]:
     for start in range(0, max(count, 1), _ROWS):
         text = io.StringIO(newline="")
         writer = csv.writer(text, delimiter=delimiter, lineterminator="\n")
-        if start == 0 and titles is not None:
-            writer.writerow(titles)
+        if start == 0:
+            writer.writerows(first)
         rows = slice(start, start + _ROWS)
         writer.writerows(zip(*(column(rows) for column in columns), strict=True))
         yield text.getvalue()

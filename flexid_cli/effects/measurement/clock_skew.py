@@ -23,7 +23,8 @@ Literature
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from math import factorial
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, Law, Stage
@@ -38,6 +39,13 @@ def _measurement(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
 
 def _columns(m: Motion, _: Sequence[float]) -> Terms:
     return Terms(joint_error=column(-m.joint_velocity))
+
+
+def _corrected(joint: Array, a: Array, derivative: Callable[[Array, int], Array]) -> Array:
+    """The position at the stamp: Taylor's series, which three terms end for skews of a few samples."""
+    skew = float(a[0])
+    terms = [skew**k / factorial(k) * derivative(joint, k) for k in (1, 2, 3)]
+    return joint + sum(terms)
 
 
 def _values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
@@ -56,5 +64,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.MEASUREMENT, _measurement),),
     energy="conserves",
-    signatures=(Signature(_columns, _values, needs_joint=True),),
+    signatures=(Signature(_columns, _values, needs_joint=True, corrected=_corrected),),
 )

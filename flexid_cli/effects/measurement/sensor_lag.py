@@ -22,7 +22,9 @@ Literature
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, EffectState, Law, Stage
@@ -44,8 +46,13 @@ def _measurement(w: Array, p: Array, x: Array, dx: Array, _g: Array) -> None:
         w[slots.MEASURED_MOTOR_RATE] = dx[1]
 
 
-def _joint(m: Motion, shape: Sequence[float]) -> Terms:
-    return Terms(joint_error=column(lagged(m.joint_position, shape[0], m.period_s) - m.joint_position))
+def _joint(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(joint_error=column(-m.joint_velocity))
+
+
+def _joint_corrected(joint: Array, a: Array, derivative: Callable[[Array, int], Array]) -> Array:
+    """The inverse of a first-order lag."""
+    return np.asarray(joint + float(a[0]) * derivative(joint, 1))
 
 
 def _motor(m: Motion, shape: Sequence[float]) -> Terms:
@@ -56,8 +63,8 @@ def _lags(scale: Scale) -> Sequence[Shape]:
     return (Shape("lag", 0.1 * scale.period_s, 0.1 / scale.resonance_hz, 10),)
 
 
-def _joint_values(_: Array, shape: Sequence[float], __: Base) -> dict[str, float]:
-    return {"joint_lag": shape[0]}
+def _joint_values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    return {"joint_lag": float(a[0])}
 
 
 def _motor_values(_: Array, shape: Sequence[float], __: Base) -> dict[str, float]:
@@ -81,7 +88,7 @@ EFFECT = Effect(
     states=(EffectState("joint", "joint_position"), EffectState("motor", "motor_position")),
     energy="exchanges",
     signatures=(
-        Signature(_joint, _joint_values, _lags, fixed=1.0, needs_joint=True),
+        Signature(_joint, _joint_values, sign=1, needs_joint=True, corrected=_joint_corrected),
         Signature(_motor, _motor_values, _lags, fixed=1.0, needs_joint=True),
     ),
 )
