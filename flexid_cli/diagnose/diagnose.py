@@ -9,20 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose import evidence, verdict
-from flexid_cli.diagnose.estimates import base_estimates, effect_estimates, solved
+from flexid_cli.diagnose.estimates import Solved, base_estimates, effect_estimates, solved
 from flexid_cli.diagnose.figures import residual_map, traces
 from flexid_cli.diagnose.fitter import Fitted, Fitter
 from flexid_cli.diagnose.location import Map, located, residual_maps
 from flexid_cli.diagnose.physical import torque_scale
-from flexid_cli.diagnose.result import Diagnosis, Evidence, HeldOut, NamedEffect, Tested, Where
-from flexid_cli.diagnose.search import Form
+from flexid_cli.diagnose.result import (
+    Diagnosis,
+    Evidence,
+    HeldOut,
+    NamedEffect,
+    SimulationError,
+    Tested,
+    Where,
+)
+from flexid_cli.diagnose.search import Candidate, Form
 from flexid_cli.diagnose.selection import Selection, select, threshold
 from flexid_cli.diagnose.simulation import simulation_error
 from flexid_cli.diagnose.start import first_problem
 from flexid_cli.effects.base import EffectValues
+from flexid_cli.effects.registry import effects as library
 from flexid_cli.estimate.result import Estimate
 from flexid_cli.estimate.verdict import demoted
-from flexid_cli.effects.registry import effects as library
 
 if TYPE_CHECKING:
     from flexid_cli.config.schema import Config
@@ -99,15 +107,14 @@ class _Report:
         known: Mapping[str, float],
     ) -> None:
         self.fitter, self.selection, self.recording, self.config = fitter, selection, recording, config
-        self.units = {"linear": recording.linear, "torque_unit": recording.torque_unit}
         self.known = known
-        self.level = config.estimate.confidence_level
         after = selection.after
         remaining = residual_maps(after.problem, after.basis)
         unexplained = verdict.is_unexplained(after.basis.rms, remaining, both=after.problem.both)
         self.verdict = verdict.decide(selection, unexplained)
         # What does not explain the record is not named: the baseline stands, and the place of its mismatch.
-        self.final: Fitted = selection.before if unexplained else after
+        named = self.verdict not in ("unexplained", "inconclusive")
+        self.final: Fitted = after if named else selection.before
         self.maps = residual_maps(selection.before.problem, selection.before.basis)
         self.other = None
         if validation is not None:
@@ -121,12 +128,8 @@ class _Report:
         named = self._effects(solved_after)
         held_out = self._held_out()
         doubt = self._doubt()
-        parameters_before = tuple(
-            demoted(e, doubt) for e in base_estimates(before, solved_before, level=self.level, **self.units)
-        )
-        parameters_after = tuple(
-            demoted(e, doubt) for e in base_estimates(after, solved_after, level=self.level, **self.units)
-        )
+        parameters_before = self._base_parameters(before, solved_before, doubt)
+        parameters_after = self._base_parameters(after, solved_after, doubt)
         place = self._place()
         share = 1.0 - max(after.cost - after.y.size, 0.0) / max(before.cost - before.y.size, 1e-300)
         equation, variable = (place.equation, place.variable) if place else ("motor", "velocity")
@@ -151,36 +154,53 @@ class _Report:
 
     def _doubt(self) -> str:
         """Why no parameter counts as identified, or nothing."""
+        if verdict.is_poor(self.selection.before.problem):
+            return "the torque hardly stands above its own noise"
         if self.verdict == "unexplained":
             return "the model leaves out something that is not known"
         if not self.final.problem.both and not self.final.problem.settled:
             return "no resonance stands out of the record, so the motor encoder alone does not show the stiffness"
         return ""
 
-    def _effects(self, result: object) -> tuple[NamedEffect, ...]:
-        final = self.final
-        if not final.chosen:
+    def _base_parameters(self, fitted: Fitted, result: Solved, doubt: str) -> tuple[Estimate, ...]:
+        found = base_estimates(
+            fitted,
+            result,
+            linear=self.recording.linear,
+            torque_unit=self.recording.torque_unit,
+            level=self.config.estimate.confidence_level,
+        )
+        return tuple(demoted(e, doubt) for e in found)
+
+    def _effects(self, result: Solved) -> tuple[NamedEffect, ...]:
+        """The chosen effects, in the order of what they explain."""
+        if not self.final.chosen:
             return ()
-        gains = evidence.gains(self.fitter, final)
-        validated = self._validated(final)
-        named = []
-        for k, chosen in enumerate(final.chosen):
-            score = evidence.score(self.fitter, final, k, len(self.fitter.forms))
-            effect = chosen.form.effect
-            alternatives = tuple(f.chosen[-1].name for f in self.selection.alternatives[k])
-            named.append(
-                NamedEffect(
-                    name=effect.name,
-                    code=effect.code,
-                    family=effect.family,
-                    alternatives=tuple(dict.fromkeys(alternatives)),
-                    parameters=effect_estimates(final, k, result, level=self.level, **self.units),
-                    evidence=Evidence(gains[k], threshold(final.problem), score.p_value, validated, score.stability),
-                    where=Where(effect.equation, _variable(effect.equation, self.maps)),
-                )
-            )
-        order = np.argsort(gains)[::-1]
-        return tuple(named[int(k)] for k in order)
+        gains = evidence.gains(self.fitter, self.final)
+        validated = self._validated(self.final)
+        named = [self._effect(k, result, gain, validated) for k, gain in enumerate(gains)]
+        return tuple(named[int(k)] for k in np.argsort(gains)[::-1])
+
+    def _effect(self, k: int, result: Solved, gain: float, validated: float) -> NamedEffect:
+        final, effect = self.final, self.final.chosen[k].form.effect
+        score = evidence.score(self.fitter, final, k, len(self.fitter.forms))
+        parameters = effect_estimates(
+            final,
+            k,
+            result,
+            linear=self.recording.linear,
+            torque_unit=self.recording.torque_unit,
+            level=self.config.estimate.confidence_level,
+        )
+        return NamedEffect(
+            name=effect.name,
+            code=effect.code,
+            family=effect.family,
+            alternatives=tuple(dict.fromkeys(f.chosen[-1].name for f in self.selection.alternatives[k])),
+            parameters=parameters,
+            evidence=Evidence(gain, threshold(final.problem), score.p_value, validated, score.stability),
+            where=Where(effect.equation, _variable(effect.equation, self.maps)),
+        )
 
     def _validated(self, final: Fitted) -> float:
         before, after = self._unseen(final)
@@ -205,55 +225,55 @@ class _Report:
         data = "blocks of the record" if self.other is None else "the other recording"
         return HeldOut(rms(before), rms(after), dict(scale), data, self.recording.torque_unit)
 
-    def _simulation(self, before: tuple, after: tuple) -> object:
+    def _simulation(self, before: tuple[Estimate, ...], after: tuple[Estimate, ...]) -> SimulationError:
         final = self.final
         values = [
-            EffectValues(
-                c.name,
-                c.form.signature.values(np.atleast_1d(final.amplitudes(k)), c.shape, final.problem.base),
-            )
+            EffectValues(c.name, c.form.signature.values(final.amplitudes(k), c.shape, final.problem.base))
             for k, c in enumerate(final.chosen)
         ]
-        position = "m" if self.recording.linear else "rad"
         return simulation_error(
             final.problem,
             {e.symbol: e.value for e in before if e.value is not None} | dict(self.known),
             {e.symbol: e.value for e in after if e.value is not None},
             values,
             unit=self.recording.torque_unit,
-            position_unit=position,
+            position_unit="m" if self.recording.linear else "rad",
         )
 
     def _place(self) -> Where | None:
         return located(self.maps[0], self.recording) if self.maps else None
 
     def _tested(self) -> tuple[Tested, ...]:
-        chosen = {c.name for c in self.final.chosen}
         met = {c.form.name: c for c in self.selection.tested}
-        rivals: Mapping[str, float] = {n: w for group in self.selection.rivals for n, w in group}
-        alternatives = {f.chosen[-1].name for group in self.selection.alternatives for f in group}
-        dropped = {c.name for c in self.selection.after.chosen} - chosen
-        out = []
-        for effect in library():
-            candidate = met.get(effect.name)
-            if effect.name in chosen:
-                reason = ""
-            elif effect.name in dropped:
-                reason = "with it the model still leaves structure that it does not explain"
-            elif effect.name in alternatives:
-                reason = "explains the record as well as the effect that was named: an alternative"
-            elif candidate is None:
-                reason = "this record cannot show it, or the baseline holds it"
-            elif candidate.refused:
-                reason = candidate.refused
-            elif chosen and effect.name in rivals:
-                reason = f"leaves {100.0 * np.expm1(rivals[effect.name]):.3g} % more than the effects that were named"
-            else:
-                reason = f"explains too little (gain below {threshold(self.final.problem):g})"
-            out.append(
-                Tested(effect.name, effect.code, None if candidate is None else candidate.gain, reason)
+        return tuple(
+            Tested(
+                e.name,
+                e.code,
+                met[e.name].gain if e.name in met else None,
+                self._reason(e.name, met.get(e.name)),
             )
-        return tuple(out)
+            for e in library()
+        )
+
+    def _reason(self, name: str, candidate: Candidate | None) -> str:
+        """Why an effect was not named, or nothing."""
+        chosen = {c.name for c in self.final.chosen}
+        rivals = {n: worse for group in self.selection.rivals for n, worse in group}
+        if name in chosen:
+            return ""
+        if self.verdict == "inconclusive":
+            return "the record is too poor to judge"
+        if name in {c.name for c in self.selection.after.chosen}:
+            return "with it the model still leaves structure that it does not explain"
+        if name in {f.chosen[-1].name for group in self.selection.alternatives for f in group}:
+            return "explains the record as well as the effect that was named: an alternative"
+        if candidate is None:
+            return "this record cannot show it, or the baseline holds it"
+        if candidate.refused:
+            return candidate.refused
+        if chosen and name in rivals:
+            return f"leaves {100.0 * np.expm1(rivals[name]):.3g} % more than the effects that were named"
+        return f"explains too little (gain below {threshold(self.final.problem):g})"
 
     def _contradicted(self, estimates: tuple[Estimate, ...]) -> tuple[str, ...]:
         """Known parameters that lie outside their intervals."""
@@ -271,9 +291,13 @@ class _Report:
         notes = [f"compared up to {problem.band_hz:.3g} Hz, where the encoders resolve the motion"]
         role = self.config.signals.torque_role
         if problem.shift > 0.0:
-            notes.append(f"the torque fits best as held from its stamp for one sample: signals.{role}.hold: sample")
+            notes.append(
+                f"the torque fits best as held from its stamp for one sample: signals.{role}.hold: sample"
+            )
         if problem.shift < 0.0:
-            notes.append(f"the torque fits best as measured at its stamp, not held: signals.{role}.hold: instant")
+            notes.append(
+                f"the torque fits best as measured at its stamp, not held: signals.{role}.hold: instant"
+            )
         return tuple(notes)
 
 

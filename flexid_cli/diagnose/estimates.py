@@ -52,9 +52,9 @@ def solved(fitted: Fitted) -> Solved:
     The encoders' noise stands in the columns too; its part of the normal matrix is that of a record of noise alone
     that passes the same chain, and is taken off.
     """
-    X, plain = fitted.basis.columns, fitted.basis.coefficients
+    problem, X, plain = fitted.problem, fitted.basis.columns, fitted.basis.coefficients
     bread = _bread(X)
-    shift = _noise_shift(fitted, bread) if fitted.problem.both else np.zeros_like(plain)
+    shift = _noise_shift(fitted, bread) if problem.both else np.zeros_like(plain)
     robust = _robust(fitted, X, bread)
     doubt = DOUBT_OF_CORRECTION * shift
     whole = plain + shift
@@ -74,7 +74,9 @@ def _bread(X: Array) -> Array:
 
 def _robust(fitted: Fitted, X: Array, bread: Array) -> RobustCovariance:
     """Covariance of the coefficients of columns, from the fit's residual; equations share their time."""
-    scores = (X * fitted.basis.residual[:, None]).reshape(fitted.problem.equations, -1, X.shape[1]).sum(axis=0)
+    scores = (
+        (X * fitted.basis.residual[:, None]).reshape(fitted.problem.equations, -1, X.shape[1]).sum(axis=0)
+    )
     return robust_covariance(scores, bread, [int(w.open.sum()) for w in fitted.problem.weights])
 
 
@@ -167,7 +169,7 @@ def _value_spread(fitted: Fitted, k: int) -> dict[str, float]:
     X, count = np.hstack([others, tangents]), tangents.shape[1]
     covariance = _robust(fitted, X, _bread(X)).covariance[-count:, -count:]
     jacobian = _jacobian(fitted, k, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
-    return {name: float(np.sqrt(max(g @ covariance @ g, 0.0))) for name, g in jacobian.items()}
+    return {name: float(np.sqrt(max(float(g @ covariance @ g), 0.0))) for name, g in jacobian.items()}
 
 
 def _tangents(fitted: Fitted, k: int) -> Array:

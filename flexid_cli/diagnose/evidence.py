@@ -31,14 +31,15 @@ def score(fitter: Fitter, fitted: Fitted, k: int, library: int) -> Score:
     """Score test of the k-th effect against the model without it.
 
     The score's sum over the record is compared with what the residual of the model with the effect makes of it in
-    blocks of time, so that coloured residuals do not make it look sure; Bonferroni's correction over the ``library`` that was searched.
+    blocks of time, so that coloured residuals do not make it look sure; Bonferroni's correction over the
+    ``library`` that was searched.
     """
     from scipy.stats import t as student
 
     chosen = fitted.chosen[k]
     rest = fitter.fit(fitted.problem, (*fitted.chosen[:k], *fitted.chosen[k + 1 :]), fitted.search)
     rows = fitted.search.rows(chosen.form, chosen.shape)
-    column = rest.basis.outside(rows) @ np.atleast_1d(fitted.amplitudes(k))[: rows.shape[1]]
+    column = rest.basis.outside(rows) @ fitted.amplitudes(k)
     parts = _blocks(column * rest.basis.residual, fitted.problem, BLOCKS)
     noise = _blocks(column * fitted.basis.residual, fitted.problem, BLOCKS)
     spread = float(np.sqrt(np.sum(noise**2)))

@@ -48,19 +48,29 @@ class Stretch:
     segment : Segment
     rate_hz, band_hz : float
         Sampling rate, and band of the rows.
+
+    Attributes
+    ----------
+    torque, motor, joint : ndarray, shape (n,)
+        The signals as recorded; the joint's is empty where it has no encoder.
+    motor_smooth, motor_velocity, joint_smooth : ndarray, shape (n,)
+        Low-passed for columns of effects.
+    motor_sharp, joint_sharp : ndarray, shape (n,)
+        Velocities whose sign is taken.
     """
 
     def __init__(self, segment: Segment, rate_hz: float, band_hz: float) -> None:
         self.rate_hz, self.period_s, self._band = rate_hz, 1.0 / rate_hz, band_hz
-        self.torque, self.motor, self.joint = segment.torque, segment.motor_position, segment.joint_position
+        self.torque, self.motor = segment.torque, segment.motor_position
+        self.joint = np.empty(0) if segment.joint_position is None else segment.joint_position
         self.segment = segment
         self.start_s = segment.start_s
-        self.time_s = segment.start_s + np.arange(segment.samples) * self.period_s
+        self.time_s: Array = segment.start_s + np.arange(segment.samples, dtype=np.float64) * self.period_s
         self.taper = Taper.of(segment.samples, rate_hz, band_hz, MARGIN)
         self.motor_smooth = self.lowpass(self.motor, SMOOTH_BAND)
         self.motor_velocity = self.derivative(self.motor_smooth, 1)
         self.motor_sharp = self.derivative(self.lowpass(self.motor, MOTOR_SIGN_BAND), 1)
-        if self.joint is not None:
+        if self.joint.size:
             self.joint_smooth = self.lowpass(self.joint, SMOOTH_BAND)
             self.joint_sharp = self.derivative(self.lowpass(self.joint, JOINT_SIGN_BAND), 1)
 
@@ -196,7 +206,9 @@ class Problem:
             return two_encoder_noise(self.base, self.noise, omega) + floor * np.eye(2)
         # What the model lacks at the motor passes 1 + X2 s + X1 s^2 as the torque itself does.
         passed = np.abs(1.0 + (self.base.FV * 1j * omega - self.base.JL * omega**2) / self.base.K) ** 2
-        return motor_only_noise(self.base, self.noise, omega) + floor * (1.0 + passed)[:, None, None]
+        return np.asarray(
+            motor_only_noise(self.base, self.noise, omega) + floor * (1.0 + passed)[:, None, None]
+        )
 
     def _motion(self, s: Stretch) -> Motion:
         base = self.base
@@ -271,6 +283,15 @@ class Problem:
 
         return self._rows(part)[:, 0]
 
+    def signal(self) -> float:
+        """RMS of the torque in the whitened rows of the motor equation: how far it stands above its noise."""
+
+        def part(s: Stretch, _: Motion) -> list[Complex | None]:
+            return self._one(s.spectrum(s.torque if self.both else self.through(s, s.torque)), "motor")
+
+        rows = self._rows(part)[: self.row_times.size, 0]
+        return float(np.sqrt(np.mean(rows**2)))
+
     def base_rows(self) -> Array:
         """Rows of the baseline's columns, in the order of ``names``."""
         return self._rows(self._base_both if self.both else self._base_alone)
@@ -285,7 +306,7 @@ class Problem:
 
     @staticmethod
     def _side_by_side(s: Stretch, motor: Sequence[Array], load: Sequence[Array]) -> list[Complex | None]:
-        """Columns of both equations, which share stiffness and zero: the last two of the motor's, the first of the load's."""
+        """Columns of both equations; the last of the motor's are the first of the load's."""
         M, L = s.spectrum(np.column_stack(motor)), s.spectrum(np.column_stack(load))
         own = len(load) - SHARED, len(motor) - SHARED
         return [
@@ -386,9 +407,8 @@ class Problem:
                 )
                 continue
             # The transpose of a derivative is its negative, of a second one itself.
-            passed = self.base.JL / self.base.K * s.derivative(
-                g[0], 2
-            ) - self.base.FV / self.base.K * s.derivative(g[0], 1)
+            inertial, viscous = self.base.JL / self.base.K, self.base.FV / self.base.K
+            passed = inertial * s.derivative(g[0], 2) - viscous * s.derivative(g[0], 1)
             out.append({"motor": g[0] + passed, "transmission": passed, "load": g[0]}[equation])
         return out
 
@@ -398,7 +418,7 @@ class Problem:
         narrow = np.sqrt(min(1.0, 2.0 * SMOOTH_BAND * self.band_hz / rate))
 
         def all_of(name: str) -> Array:
-            return np.abs(np.concatenate([getattr(m, name) for m in self.motions]))
+            return np.asarray(np.abs(np.concatenate([getattr(m, name) for m in self.motions])))
 
         def travel(name: str) -> float:
             return float(np.ptp(np.concatenate([getattr(m, name) for m in self.motions])))
@@ -446,7 +466,8 @@ class Problem:
             n: getattr(b, n) * float(np.clip(1.0 + v[n] / getattr(b, n), 0.7, 1.4)) for n in ("Jm", "K", "JL")
         }
         if self.anchor is not None:
-            strong = {n: float(np.clip(x, getattr(self.anchor, n) / ASTRAY, getattr(self.anchor, n) * ASTRAY)) for n, x in strong.items()}
+            held = {n: float(getattr(self.anchor, n)) for n in strong}
+            strong = {n: float(np.clip(x, held[n] / ASTRAY, held[n] * ASTRAY)) for n, x in strong.items()}
         return replace(b, **{n: getattr(b, n) + v[n] for n in ("FVm", "FSm", "FV", "FS")}, **strong)
 
 

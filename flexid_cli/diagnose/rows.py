@@ -129,7 +129,8 @@ def two_encoder_noise(base: Base, noise: NoiseLevels, omega: Array) -> Complex:
             np.stack(
                 [zero + noise.torque, motor * noise.motor_position, zero - base.K * noise.joint_position], -1
             ),
-            np.stack([zero, zero + base.K * noise.motor_position, -load * noise.joint_position], -1),
+            # Noise of the torsion pulls on motor and load in opposite directions.
+            np.stack([zero, zero - base.K * noise.motor_position, load * noise.joint_position], -1),
         ],
         -2,
     )

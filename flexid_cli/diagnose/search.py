@@ -94,11 +94,13 @@ class Search:
     def rows(self, form: Form, shape: tuple[float, ...]) -> Array:
         """Whitened columns of a form for unit amplitudes."""
         key = (form, shape)
-        if key not in self._rows:
+        found = self._rows.get(key)
+        if found is None:
+            found = self.problem.effect_rows(lambda m: form.signature.columns(m, shape))
             if len(self._rows) > CACHED:
                 self._rows.clear()
-            self._rows[key] = self.problem.effect_rows(lambda m: form.signature.columns(m, shape))
-        return self._rows[key]
+            self._rows[key] = found
+        return found
 
     def shapes(self, form: Form) -> Sequence[Shape] | None:
         """Shape parameters with their ranges; None where the record cannot show the form."""

@@ -77,8 +77,7 @@ def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted | N
     if possible[0].gain < 0.5 * ENOUGH:
         return None
     trials = [
-        fitter.relax(fitted.problem, (*fitted.chosen, Chosen(c.form, c.shape)), rounds=2)
-        for c in rivals
+        fitter.relax(fitted.problem, (*fitted.chosen, Chosen(c.form, c.shape)), rounds=2) for c in rivals
     ]
     return min(trials, key=lambda f: f.loss)
 

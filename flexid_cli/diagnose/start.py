@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 HIGHEST_BAND = 0.2  # of the sampling rate
 FIRST_WIDTH = 0.004  # of the highest speed
 SCAN_POINTS, SCAN_STEPS = 14, 4
+RIGID = 100.0  # times the band: a resonance that is nowhere in it
 SCANNED_WITH = ("torque_offset", "gravity", "joint_damping", "load_dependent_friction", "viscous_nonlinear")
 SCAN_LOW = 8.0  # lowest locked-motor frequency looked at, cycles in the record
 
@@ -53,9 +54,16 @@ def first_problem(recording: Recording, config: Config, fitter: Fitter) -> Probl
     width = FIRST_WIDTH * speed
     base = (_both_base if both else _rigid_base)(stretches, width)
     problem = Problem(
-        stretches, base, noise_levels(recording), band, gravity=config.axis.gravity_m_per_s2, gear_ratio=config.axis.gear_ratio,
-        duration_s=recording.duration_s, both=both, shift=fitter.shifts[0],
-    )  # fmt: skip
+        stretches,
+        base,
+        noise_levels(recording),
+        band,
+        gravity=config.axis.gravity_m_per_s2,
+        gear_ratio=config.axis.gear_ratio,
+        duration_s=recording.duration_s,
+        both=both,
+        shift=fitter.shifts[0],
+    )
     if not both:
         known = _identified(recording, config, width)
         problem = _scanned(problem, fitter) if known is None else problem.at(known)
@@ -148,21 +156,30 @@ def _identified(recording: Recording, config: Config, width: float) -> Base | No
     except DataError:
         return None
     v = {e.symbol: e.value for e in model.parameters if e.value is not None}
-    if not all(v.get(name, 0.0) > 0.0 for name in ("Jm", "K", "JL")):
+    sure = any(e.symbol == "K" and e.verdict == "identified" for e in model.parameters)
+    if not sure or not all(v.get(name, 0.0) > 0.0 for name in ("Jm", "K", "JL")):
         return None
     reversal_width = model.pipeline.reversal_velocity or width
     friction = {name: v.get(name, 0.0) for name in ("FVm", "FSm", "FV", "FS")}
-    return Base(v["Jm"], v["K"], v["JL"], **friction, motor_reversal=reversal_width, load_reversal=reversal_width)
+    return Base(
+        v["Jm"], v["K"], v["JL"], **friction, motor_reversal=reversal_width, load_reversal=reversal_width
+    )
 
 
 def _scanned(problem: Problem, fitter: Fitter) -> Problem:
     """The most likely of a series of locked-motor frequencies, each followed for a few Gauss-Newton steps.
 
     Effects that are linear in their amplitudes are in the fit, so that what the baseline lacks does not draw its
-    stiffness away.
+    stiffness away. A rigid axis is one of the series.
     """
-    free = [Chosen(f, ()) for f in fitter.forms if f.name in SCANNED_WITH and not f.signature.shapes(problem.scale())]
-    base, trials = problem.base, []
+    free = [
+        Chosen(f, ())
+        for f in fitter.forms
+        if f.name in SCANNED_WITH and not f.signature.shapes(problem.scale())
+    ]
+    base = problem.base
+    rigid = problem.at(replace(base, K=base.JL * (2.0 * np.pi * RIGID * problem.band_hz) ** 2))
+    trials = [(fitter.fit(rigid, free).loss, rigid)]
     low = SCAN_LOW / problem.duration_s
     for frequency in np.geomspace(max(low, 0.02 * problem.band_hz), 0.8 * problem.band_hz, SCAN_POINTS):
         trial = problem.at(replace(base, K=base.JL * (2.0 * np.pi * float(frequency)) ** 2))
@@ -202,7 +219,9 @@ def _misfit(problem: Problem, s: Stretch) -> Array:
     """Misfit of the motor equation, or of eq. (18), over time."""
     b = problem.base
     acceleration, velocity = s.derivative(s.motor, 2), s.derivative(s.motor, 1)
-    rest = s.torque - b.Jm * acceleration - b.FVm * velocity - b.FSm * reversal(s.motor_sharp, b.motor_reversal)
+    rest = (
+        s.torque - b.Jm * acceleration - b.FVm * velocity - b.FSm * reversal(s.motor_sharp, b.motor_reversal)
+    )
     if problem.both:
         return np.asarray(rest - b.K * (s.motor - s.joint))
     load = b.JL * acceleration + b.FV * velocity + b.FS * reversal(s.motor_sharp, b.load_reversal)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from flexid_cli.diagnose.location import Map
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.result import NamedEffect, Verdict
 from flexid_cli.diagnose.selection import Selection
 
@@ -13,7 +14,7 @@ from flexid_cli.diagnose.selection import Selection
 UNEXPLAINED_GAIN = 0.25
 UNEXPLAINED_RMS = 2.5
 # Without a joint encoder the joint's motion is rebuilt, and its reversals are blurred.
-UNEXPLAINED_GAIN_ALONE = 0.5
+UNEXPLAINED_GAIN_ALONE, UNEXPLAINED_RMS_ALONE = 0.5, 3.5
 # A record whose torque stands less than this above its own noise cannot be judged.
 LEAST_SIGNAL = 10.0
 
@@ -42,14 +43,26 @@ VARIABLES = {
 }
 
 
+def is_poor(problem: Problem) -> bool:
+    """Whether a record's torque hardly stands above its own noise."""
+    return problem.signal() < LEAST_SIGNAL
+
+
 def is_unexplained(rms: float, maps: Sequence[Map], *, both: bool) -> bool:
     """Whether a model leaves what its noise does not explain."""
-    limit = UNEXPLAINED_GAIN if both else UNEXPLAINED_GAIN_ALONE
-    return rms > UNEXPLAINED_RMS or (bool(maps) and maps[0].gain > limit)
+    gain, most = (
+        (UNEXPLAINED_GAIN, UNEXPLAINED_RMS) if both else (UNEXPLAINED_GAIN_ALONE, UNEXPLAINED_RMS_ALONE)
+    )
+    return rms > most or (bool(maps) and maps[0].gain > gain)
 
 
 def decide(selection: Selection, unexplained: bool) -> Verdict:
     """Verdict of a selection whose remainder is explained or not."""
+    problem = selection.before.problem
+    # A start that could not be trusted, and nothing that explains the record: the baseline may stand anywhere.
+    astray = not problem.settled and (unexplained or not selection.after.chosen)
+    if is_poor(problem) or astray:
+        return "inconclusive"
     if unexplained:
         return "unexplained"
     if not selection.after.chosen:
@@ -62,9 +75,15 @@ def sentence(
 ) -> str:
     """What a person should take from it; ``share`` is what of the mismatch the effects explain."""
     if verdict == "adequate":
-        return "The model explains the recording down to the noise of its signals: nothing is missing that it could show."
+        return (
+            "The model explains the recording down to the noise of its signals: nothing is missing that it could"
+            " show."
+        )
     if verdict == "inconclusive":
-        return "The recording is too poor to judge: its torque hardly stands above its own noise."
+        return (
+            "The recording is too poor to judge: its torque hardly stands above its own noise, or it shows no"
+            " resonance."
+        )
     if verdict == "unexplained":
         return (
             f"The recording holds something that no effect of the library explains; it sits {PLACES[equation]}, as a"
@@ -83,11 +102,13 @@ def advice(
     effects: Sequence[NamedEffect], best_recordings: dict[str, str], verdict: Verdict, variable: str
 ) -> tuple[str, ...]:
     """What to record next."""
-    if verdict == "unexplained":
+    if verdict == "inconclusive":
         return (
-            f"Repeat the recording with another trajectory, at half the speed and at half the amplitude: what stays a"
-            f" function of {VARIABLES[variable]} is its cause's.",
+            "Move the axis with more acceleration, up to its first resonance: torque must outweigh noise.",
         )
+    if verdict == "unexplained":
+        again = "Repeat the recording with another trajectory, at half the speed and at half the amplitude"
+        return (f"{again}: what stays a function of {VARIABLES[variable]} is its cause's.",)
     out = []
     for e in effects:
         if e.alternatives:

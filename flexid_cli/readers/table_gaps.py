@@ -48,7 +48,7 @@ class TablePart:
         """Look for samples that physics does not allow in columns that no checksum covers."""
         found: set[int] = set()
         for column in columns:
-            places = lone_jumps_in_parts(column.values[self.first : self.end]) + self.first
+            places = lone_jumps_in_parts(_finite(column.values[self.first : self.end])) + self.first
             if places.size:
                 found.update(places.tolist())
                 samples = "1 sample" if places.size == 1 else f"{places.size} samples"
@@ -121,3 +121,9 @@ def without(channels: Mapping[int, RawChannel], left_out: Mask) -> dict[int, Raw
         )
         for place, channel in channels.items()
     }
+
+
+def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Without infinite values: no damage writes one into a text, so the drive did, and it counts as invalid later."""
+    endless = np.isinf(values)
+    return np.where(endless, np.nan, values) if endless.any() else values

@@ -98,7 +98,7 @@ WRONG: dict[str, tuple[str, str, str, str, str, str]] = {
     "models empty": (MODELS, "models: []", "models", "[]", "not empty", ""),
     "model twice": ("motor_only]", "two_encoders]", "models[1]", "two_encoders]", "listed twice", "remove"),
     "model without its encoder": (JOINT + "\n", "", "models[0]", "two_encoders", "needs joint_position", "motor_only"),
-    "bad enum": (MODELS, "estimate: {method: structurd}", "estimate.method", "structurd", "one of auto, ols, wls, structured", "did you mean structured?"),
+    "bad enum": (MODELS, "estimate: {method: structurd}", "estimate.method", "structurd", "one of auto, ols, wls, irls, iv, structured, minimum_distance, output_error", "did you mean structured?"),
     "percent": (MODELS, "estimate: {confidence_level: 95}", "estimate.confidence_level", "95", "less than 1", "0.95 for 95 %"),
     "linear joint, rotary motor": ("joint, unit: rad", "joint, unit: mm", "signals.joint_position.unit", "mm", "in mm (linear)", "rad, mrad"),
     "force on a rotary axis": (CURRENT, "  joint_torque: {source: f, unit: N}", "signals.joint_torque.unit", "N}", "in N (linear)", "N.m"),

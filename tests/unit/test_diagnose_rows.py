@@ -1,0 +1,145 @@
+"""Whitened rows: noise becomes white with unit variance, relations hold, and the transpose is one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.rows import Taper, Weights
+from flexid_cli.effects.motion import Base, Terms
+from flexid_cli.estimate.budget import NoiseLevels
+from flexid_cli.signals.recording import Segment
+
+RATE, BAND, SAMPLES = 1000.0, 60.0, 16_000
+BASE = Base(
+    Jm=2.0, K=3000.0, JL=1.5, FVm=1.0, FSm=0.0, FV=0.4, FS=0.0, motor_reversal=0.01, load_reversal=0.01
+)
+LINEAR = {"Jm": BASE.Jm, "FVm": BASE.FVm, "K": BASE.K, "JL": BASE.JL, "FV": BASE.FV}
+TIME = np.arange(SAMPLES) / RATE
+
+
+def problem(segment: Segment, noise: NoiseLevels, shift: float = 0.0) -> Problem:
+    return Problem(
+        [Stretch(segment, RATE, BAND)],
+        BASE,
+        noise,
+        BAND,
+        gravity=9.81,
+        gear_ratio=1.0,
+        duration_s=SAMPLES / RATE,
+        both=segment.joint_position is not None,
+        shift=shift,
+    )
+
+
+def noise_only(noise: NoiseLevels, both: bool) -> Problem:
+    rng = np.random.default_rng(7)
+    torque, motor, joint = (
+        size * rng.standard_normal(SAMPLES)
+        for size in (noise.torque, noise.motor_position, noise.joint_position)
+    )
+    return problem(Segment(0.0, torque, motor, joint if both else None), noise)
+
+
+def misfit(p: Problem) -> np.ndarray:
+    """What the linear baseline leaves of both equations, shape (2, rows)."""
+    columns = p.base_rows()[:, [p.names.index(name) for name in LINEAR]]
+    return (p.target() - columns @ np.array(list(LINEAR.values()))).reshape(2, -1)
+
+
+def smooth(seed: int) -> np.ndarray:
+    """A signal well inside the band."""
+    rng = np.random.default_rng(seed)
+    waves = [np.sin(2.0 * np.pi * f * TIME + phase) for f, phase in rng.uniform(0.3, 30.0, (12, 2))]
+    return np.asarray(rng.standard_normal(12) @ np.array(waves))
+
+
+@pytest.mark.parametrize("equations", [1, 2])
+def test_back_is_the_transpose_of_apply_over_the_taper(equations):
+    rng = np.random.default_rng(3)
+    taper = Taper.of(SAMPLES, RATE, BAND, 48)
+    root = rng.standard_normal((equations, equations)) + 1j * rng.standard_normal((equations, equations))
+    ramp = 1.0 + taper.frequency_hz / BAND
+    spectral = (root @ root.conj().T + 2.0 * np.eye(equations)) * ramp[:, None, None]
+    spectral = spectral.real.astype(np.complex128)
+    weights = Weights(taper, spectral)
+    columns = [smooth(k) for k in range(equations)]
+    rows = weights.apply([taper.spectrum(c[:, None]) for c in columns])[:, :, 0]
+    other = rng.standard_normal(rows.shape)
+    forth = float(np.sum(rows * other))
+    back = float(np.sum(np.array(columns) * weights.back(other)))
+    assert back == pytest.approx(forth, abs=1e-5 * np.linalg.norm(rows) * np.linalg.norm(other))
+
+
+@pytest.mark.parametrize("both", [True, False])
+@pytest.mark.parametrize("equation", ["motor", "transmission", "load"])
+def test_back_through_the_model_is_the_transpose_of_an_effects_rows(both, equation):
+    p = noise_only(NoiseLevels(0.05, 1e-5, 2e-5), both)
+    column = smooth(5)
+    rows = p.effect_rows(lambda _: Terms(**{equation: column[:, None]}))[:, 0]
+    other = np.random.default_rng(11).standard_normal(rows.size)
+    (back,) = p.back(other, equation)
+    assert back @ column == pytest.approx(rows @ other, abs=1e-5 * np.linalg.norm(rows) * rows.size**0.5)
+
+
+# Where the torque's noise rules, where both do, and where only the encoders' is left.
+@pytest.mark.parametrize("torque", [5.0, 0.05, 0.001])
+def test_noise_of_all_signals_gives_white_rows_of_unit_variance(torque):
+    noise = NoiseLevels(torque, 1e-5, 2e-5)
+    e = misfit(noise_only(noise, both=True))
+    rows = e.shape[1]
+    np.testing.assert_allclose(e.std(axis=1), 1.0, atol=4.0 / np.sqrt(2.0 * rows))
+    assert abs(np.corrcoef(e)[0, 1]) < 4.0 / np.sqrt(rows)
+    for x in e:
+        assert abs(np.corrcoef(x[1:], x[:-1])[0, 1]) < 4.0 / np.sqrt(rows)
+
+
+# With no torque noise at all the taper leaks some of the encoder's, which grows with the fourth power of frequency.
+@pytest.mark.parametrize("torque", [5.0, 0.05])
+def test_noise_of_the_motors_signals_alone(torque):
+    p = noise_only(NoiseLevels(torque, 1e-5, 0.0), both=False)
+    e = p.target()
+    assert e.std() == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * e.size))
+
+
+def test_a_linear_relation_holds_in_the_rows():
+    """Signals that obey the equations exactly leave nothing beside their size."""
+    joint, w = 1e-2 * np.sin(2.0 * np.pi * 3.0 * TIME), 2.0 * np.pi * 3.0
+    rate = 1e-2 * w * np.cos(w * TIME)
+    spring = BASE.JL * (-(w**2) * joint) + BASE.FV * rate
+    motor = joint + spring / BASE.K
+    response = (BASE.JL * -(w**2) + 1j * w * BASE.FV) / BASE.K + 1.0
+    wave = 1e-2 * response * np.exp(1j * w * TIME) / 1j
+    torque = (BASE.Jm * (1j * w) ** 2 * wave + BASE.FVm * 1j * w * wave).real + spring
+    np.testing.assert_allclose(wave.real, motor, atol=1e-12)
+    p = problem(Segment(0.0, torque, motor, joint), NoiseLevels(0.01, 1e-7, 1e-7))
+    assert np.abs(misfit(p)).max() < 1e-5 * np.abs(p.target()).max()
+    alone = problem(Segment(0.0, torque, motor, None), NoiseLevels(0.01, 1e-7, 0.0))
+    assert np.abs(alone.target()).max() < 1e-5 * alone.signal()
+
+
+def test_a_held_torque_is_the_same_as_one_that_acts_half_a_period_later():
+    """A staircase of a sine is the sine half a period late, damped by the hold."""
+    w, late = 2.0 * np.pi * 20.0, 0.5 / RATE
+    damping = np.sinc(20.0 / RATE)
+    zero = np.zeros(SAMPLES)
+    at_stamp = problem(Segment(0.0, np.sin(w * TIME), zero, zero), NoiseLevels(1.0, 1e-9, 1e-9))
+    acting = problem(
+        Segment(0.0, damping * np.sin(w * (TIME - late)), zero, zero), NoiseLevels(1.0, 1e-9, 1e-9)
+    )
+    np.testing.assert_allclose(
+        at_stamp.target(shift=0.5), acting.target(), atol=2e-3 * np.ptp(acting.target())
+    )
+    assert np.abs(at_stamp.target() - acting.target()).max() > 0.02 * np.ptp(acting.target())
+
+
+def test_the_signal_is_the_torque_over_its_noise():
+    rng = np.random.default_rng(2)
+    zero = np.zeros(SAMPLES)
+    for size in (0.5, 20.0):
+        # White torque of `size` times the noise stands `size` times above it at every frequency.
+        p = problem(
+            Segment(0.0, size * rng.standard_normal(SAMPLES), zero, zero), NoiseLevels(1.0, 1e-12, 1e-12)
+        )
+        assert p.signal() == pytest.approx(size, rel=0.08)

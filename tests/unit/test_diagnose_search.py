@@ -1,0 +1,181 @@
+"""The search for one effect: what is planted in the rows is found, and what physics forbids is refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from flexid_cli.diagnose.basis import Basis, solve
+from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.search import Candidate, Form, Search, golden
+from flexid_cli.effects.motion import Base
+from flexid_cli.effects.registry import effect, effects
+from flexid_cli.estimate.budget import NoiseLevels
+from flexid_cli.signals.recording import Segment
+
+RATE, BAND, SAMPLES = 500.0, 50.0, 10_000
+BASE = Base(
+    Jm=2.0, K=3000.0, JL=1.5, FVm=1.0, FSm=0.5, FV=0.4, FS=0.2, motor_reversal=0.01, load_reversal=0.01
+)
+FORMS = [Form(e, k) for e in effects() for k in range(len(e.signatures))]
+
+
+def form(name: str, index: int = 0) -> Form:
+    return Form(effect(name), index)
+
+
+@pytest.fixture(scope="module")
+def search() -> Search:
+    """A smooth motion of a linear flexible axis over three radians, with a little noise."""
+    rng = np.random.default_rng(4)
+    time = np.arange(SAMPLES) / RATE
+    motor, joint, torque = np.zeros(SAMPLES), np.zeros(SAMPLES), np.zeros(SAMPLES)
+    for f, size in [(0.11, 1.2), (0.37, 0.4), (1.3, 0.1), (4.1, 0.02), (7.7, 0.01)]:
+        s = 2j * np.pi * f
+        wave = size * np.exp(s * time + 1j * rng.uniform(0.0, 6.0))
+        load = BASE.JL * s**2 + BASE.FV * s
+        joint += wave.real
+        motor += ((1.0 + load / BASE.K) * wave).real
+        torque += ((BASE.Jm * s**2 + BASE.FVm * s) * (1.0 + load / BASE.K) * wave + load * wave).real
+    noise = NoiseLevels(0.05, 2e-6, 2e-6)
+    segment = Segment(
+        0.0,
+        torque + noise.torque * rng.standard_normal(SAMPLES),
+        motor + noise.motor_position * rng.standard_normal(SAMPLES),
+        joint + noise.joint_position * rng.standard_normal(SAMPLES),
+    )
+    problem = Problem(
+        [Stretch(segment, RATE, BAND)],
+        BASE,
+        noise,
+        BAND,
+        gravity=9.81,
+        gear_ratio=50.0,
+        duration_s=SAMPLES / RATE,
+        both=True,
+        shift=0.0,
+    )
+    return Search(problem, FORMS)
+
+
+def planted(search: Search, what: Form, shape: tuple[float, ...], amplitudes: list[float]) -> Basis:
+    """The baseline's fit where an effect of this size is in the rows."""
+    return solve(search.base, search.target + search.rows(what, shape) @ np.array(amplitudes))
+
+
+def found(search: Search, what: Form, now: Basis) -> Candidate:
+    candidate = search.best(what, now)
+    assert candidate is not None
+    return candidate
+
+
+def values(search: Search, candidate: Candidate) -> dict[str, float]:
+    signature = candidate.form.signature
+    return signature.values(candidate.amplitudes, candidate.shape, search.problem.base)
+
+
+def test_golden_section_closes_in_on_a_minimum():
+    tried: list[float] = []
+
+    def cost(x: float) -> float:
+        tried.append(x)
+        return (x - 0.3) ** 2
+
+    assert golden(cost, -1.0, 2.0, 20) == pytest.approx(0.3, abs=3.0 * 0.618**20)
+    assert len(tried) == 22
+    assert min(tried) > -1.0
+    assert max(tried) < 2.0
+    assert golden(lambda x: x, 0.0, 1.0, 12) < 0.01
+
+
+# Between the points of the coarse search and on them, over the whole range.
+@pytest.mark.parametrize("cycles", [7.13, 20.0, 41.7, 66.4])
+@pytest.mark.parametrize("name", ["cogging", "transmission_error"])
+def test_ripple_search_finds_the_cycles_of_a_planted_sine(search, name, cycles):
+    size, phase = (0.4, 0.7) if name == "cogging" else (2e-4, 0.7)
+    waves = [size * math.sin(phase), size * math.cos(phase)]
+    now = planted(search, form(name), (cycles,), waves)
+    candidate = found(search, form(name), now)
+    assert candidate.shape[0] == pytest.approx(cycles, abs=0.03)  # one turn over the travel is two
+    size_name, _, phase_name = (p.name for p in effect(name).parameters)
+    assert values(search, candidate)[size_name] == pytest.approx(size, rel=0.05)
+    assert values(search, candidate)[phase_name] == pytest.approx(phase, abs=0.05)
+    assert candidate.gain > 0.5
+
+
+def test_a_record_that_hardly_moves_shows_no_ripple(search):
+    short = Search(search.problem, FORMS)
+    object.__setattr__(short, "scale", short.scale.__class__(**{**vars(short.scale), "motor_range": 1e-4}))
+    assert short.best(form("cogging"), solve(short.base, short.target)) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "index", "shape", "size"),
+    [
+        ("stribeck_motor", 0, (0.21,), 1.5),
+        ("viscous_nonlinear", 1, (0.47,), 2.0),
+        ("hardening_stiffness", 1, (0.0031,), 2000.0),
+        ("hysteresis", 0, (0.0011,), 0.8),
+        ("thermal_drift", 0, (9.0,), 1.0),
+        ("payload_change", 0, (11.3,), 0.2),
+    ],
+)
+def test_shapes_are_searched_not_gridded(search, name, index, shape, size):
+    now = planted(search, form(name, index), shape, [size])
+    candidate = found(search, form(name, index), now)
+    assert not candidate.refused
+    assert candidate.shape[0] == pytest.approx(shape[0], rel=0.05)
+    assert candidate.amplitudes[0] == pytest.approx(size, rel=0.1)
+    white = solve(search.base, search.target).cost
+    assert candidate.gain > 0.9 * math.log(now.cost / white)
+
+
+def test_a_sign_that_physics_forbids_is_refused(search):
+    now = planted(search, form("joint_damping"), (), [-5.0])
+    candidate = found(search, form("joint_damping"), now)
+    assert "sign" in candidate.refused
+    assert candidate.cost == candidate.before
+    assert candidate.amplitudes[0] == pytest.approx(-5.0, rel=0.05)
+    right = found(search, form("joint_damping"), planted(search, form("joint_damping"), (), [5.0]))
+    assert not right.refused
+    assert right.rank < candidate.rank
+
+
+def test_values_that_tie_otherwise_are_refused(search):
+    """A weak spot of the spring with a fifth of its stiffness missing is no gap."""
+    shape, play = (0.002, 0.0), form("backlash")
+    weak = search.evaluate(play, shape, planted(search, play, shape, [0.2 * BASE.K]))
+    assert "inside the gap" in weak.refused
+    gap = search.evaluate(play, shape, planted(search, play, shape, [BASE.K]))
+    assert not gap.refused
+    assert gap.amplitudes[0] == pytest.approx(BASE.K, rel=0.02)
+
+
+def test_columns_of_the_baseline_are_refused(search):
+    candidate = found(search, form("gravity"), solve(search.base, search.target))
+    assert "depend" in candidate.refused
+    assert candidate.gain == 0.0
+
+
+def test_a_fixed_amplitude_is_not_fitted(search):
+    """A limit takes off what is beyond it, not half of that."""
+    what, limit = form("torque_saturation"), 0.7 * search.scale.torque
+    whole = search.evaluate(what, (limit,), planted(search, what, (limit,), [1.0]))
+    assert whole.amplitudes.tolist() == [1.0]
+    white = solve(search.base, search.target).cost
+    assert whole.cost == pytest.approx(white, rel=1e-6)
+    half = search.evaluate(what, (limit,), planted(search, what, (limit,), [0.5]))
+    assert half.cost > 1.2 * white
+    best = found(search, what, planted(search, what, (limit,), [1.0]))
+    assert values(search, best)["torque_limit"] == pytest.approx(limit, rel=0.01)
+
+
+def test_what_is_in_the_model_explains_nothing_more(search):
+    what, shape = form("cogging"), (20.0,)
+    target = search.target + search.rows(what, shape) @ np.array([0.3, 0.2])
+    now = solve(np.hstack([search.base, search.rows(what, shape)]), target)
+    candidate = search.evaluate(what, shape, now)
+    assert candidate.gain == 0.0
+    assert candidate.refused
