@@ -46,7 +46,7 @@ import yaml  # noqa: E402
 
 from benchmarks.machine.cases import LISTS, NONE, Case, CaseError, Task, columns, configuration, make, tasks  # noqa: E402
 
-TOOL = "flexid_cli.diagnose:diagnose"
+TOOL = "flexid_cli.diagnose.diagnose:diagnose"
 Z = 1.959964  # two-sided 95 %
 REPAIRED = 1.15  # held-out residual over the noise floor
 SECONDS_45 = 10.0  # for 45 s at 1 kHz
@@ -179,7 +179,7 @@ def summary(answer: Any) -> Result:
         for effect in _get(answer, "effects") or ()
     ]
     location = _get(answer, "location")
-    held_out = _get(_get(answer, "fit"), "held_out")
+    held_out = _get(answer, "held_out") or _get(_get(answer, "fit"), "held_out")
     return {
         "verdict": _get(answer, "verdict"),
         "effects": effects,

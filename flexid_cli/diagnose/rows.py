@@ -55,7 +55,8 @@ class Taper:
         from scipy.fft import rfft
 
         tapered = x * self.window[:, None]
-        return rfft(tapered, self.transform, axis=0)[: self.frequency_hz.size]
+        whole = rfft(tapered, self.transform, axis=0)
+        return np.asarray(whole[: self.frequency_hz.size], dtype=np.complex128)
 
 
 class Weights:
