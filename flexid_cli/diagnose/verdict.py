@@ -12,9 +12,9 @@ from flexid_cli.diagnose.selection import Selection
 # Calibrated, see docs/diagnosis.md: gain of a free function of one variable that nothing explains by chance, and
 # RMS of whitened rows that the finite filters leave of a complete model.
 UNEXPLAINED_GAIN = 0.25
-UNEXPLAINED_RMS = 2.5
+UNEXPLAINED_RMS = 4.0
 # Without a joint encoder the joint's motion is rebuilt, and its reversals are blurred.
-UNEXPLAINED_GAIN_ALONE, UNEXPLAINED_RMS_ALONE = 0.5, 3.5
+UNEXPLAINED_GAIN_ALONE, UNEXPLAINED_RMS_ALONE = 0.5, 4.0
 # A record whose torque stands less than this above its own noise cannot be judged.
 LEAST_SIGNAL = 10.0
 
