@@ -269,7 +269,12 @@ class Measured:
 
 
 def measure(candidate: Candidate, path: Path, tiny: Path, messages: int) -> None:
-    """Run a candidate in this process, and print what was measured as JSON."""
+    """Run a candidate in this process, and print what was measured as JSON.
+
+    pandas loads pyarrow where it is there, for nothing that is measured here: only who needs it gets to see it.
+    """
+    if candidate.needs != "pyarrow":
+        sys.modules["pyarrow"] = None  # type: ignore[assignment]
     candidate.read(tiny)
     start = time.perf_counter()
     arrays, kept = candidate.read(path)

@@ -125,8 +125,8 @@ class _Report:
         before, after = self.selection.before, self.final
         solved_before = solved(before)
         solved_after = solved(after) if after is not before else solved_before
-        named = self._effects(solved_after)
-        held_out = self._held_out()
+        unseen = self._unseen()
+        named = self._effects(solved_after, evidence.held_out_gain(*unseen))
         doubt = self._doubt()
         parameters_before = self._base_parameters(before, solved_before, doubt)
         parameters_after = self._base_parameters(after, solved_after, doubt)
@@ -139,7 +139,7 @@ class _Report:
             model="two_encoders" if before.problem.both else "motor_only",
             effects=named,
             location=place if self.verdict == "unexplained" else None,
-            held_out=held_out,
+            held_out=self._held_out(*unseen),
             simulation=self._simulation(parameters_before, parameters_after),
             parameters_before=parameters_before,
             parameters_after=parameters_after,
@@ -172,12 +172,11 @@ class _Report:
         )
         return tuple(demoted(e, doubt) for e in found)
 
-    def _effects(self, result: Solved) -> tuple[NamedEffect, ...]:
+    def _effects(self, result: Solved, validated: float) -> tuple[NamedEffect, ...]:
         """The chosen effects, in the order of what they explain."""
         if not self.final.chosen:
             return ()
         gains = evidence.gains(self.fitter, self.final)
-        validated = self._validated(self.final)
         named = [self._effect(k, result, gain, validated) for k, gain in enumerate(gains)]
         return tuple(named[int(k)] for k in np.argsort(gains)[::-1])
 
@@ -202,19 +201,15 @@ class _Report:
             where=Where(effect.equation, _variable(effect.equation, self.maps)),
         )
 
-    def _validated(self, final: Fitted) -> float:
-        before, after = self._unseen(final)
-        return evidence.held_out_gain(before, after)
-
-    def _unseen(self, final: Fitted) -> tuple[Array, Array]:
-        """Residual rows of both models on data that they were not fitted to."""
+    def _unseen(self) -> tuple[Array, Array]:
+        """Residual rows of the baseline and of the final model on data that they were not fitted to."""
+        before, after = self.selection.before, self.final
         if self.other is None:
-            return evidence.cross_validated(self.selection.before), evidence.cross_validated(final)
-        first = evidence.predicted(self.other, self.fitter, self.selection.before)
-        return first, evidence.predicted(self.other, self.fitter, final)
+            return evidence.cross_validated(before), evidence.cross_validated(after)
+        first = evidence.predicted(self.other, self.fitter, before)
+        return first, evidence.predicted(self.other, self.fitter, after)
 
-    def _held_out(self) -> HeldOut:
-        before, after = self._unseen(self.final)
+    def _held_out(self, before: Array, after: Array) -> HeldOut:
         problem = self.final.problem
         scale = torque_scale(problem)
 

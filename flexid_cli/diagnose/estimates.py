@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.fitter import Fitted
-from flexid_cli.diagnose.problem import MODEL_FLOOR, Problem, Stretch
+from flexid_cli.diagnose.problem import MODEL_FLOOR, SCALED, Problem, Stretch
 from flexid_cli.effects.base import unit_of
 from flexid_cli.estimate.covariance import RobustCovariance, robust_covariance
 from flexid_cli.estimate.result import Estimate
@@ -54,7 +54,7 @@ def solved(fitted: Fitted) -> Solved:
     """
     problem, X, plain = fitted.problem, fitted.basis.columns, fitted.basis.coefficients
     bread = _bread(X)
-    shift = _noise_shift(fitted, bread) if problem.both else np.zeros_like(plain)
+    shift = _noise_shift(fitted) if problem.both else np.zeros_like(plain)
     robust = _robust(fitted, X, bread)
     doubt = DOUBT_OF_CORRECTION * shift
     whole = plain + shift
@@ -62,7 +62,26 @@ def solved(fitted: Fitted) -> Solved:
     if not problem.both:
         size[: len(problem.names)] += [abs(getattr(problem.base, name)) for name in problem.names]
     floor = np.diag((FLOOR_SHARE * MODEL_FLOOR * size) ** 2)
-    return Solved(whole, robust.covariance + np.outer(doubt, doubt) + floor, robust.degrees_of_freedom)
+    covariance = robust.covariance + np.outer(doubt, doubt) + floor
+    if problem.both:
+        whole, covariance = unscaled(fitted, whole, covariance)
+    return Solved(whole, covariance, robust.degrees_of_freedom)
+
+
+def unscaled(fitted: Fitted, coefficients: Array, covariance: Array) -> tuple[Array, Array]:
+    """The load's parameters without the factor K0 / K of `Problem`, and K without the effects' stiffness."""
+    problem = fitted.problem
+    k, whole = problem.names.index("K"), problem.stiffness
+    G, out = np.eye(coefficients.size), coefficients.copy()
+    for name in SCALED:
+        i = problem.names.index(name)
+        G[i, i], G[i, k] = coefficients[k] / whole, coefficients[i] / whole
+        out[i] *= G[i, i]
+    for n, chosen in enumerate(fitted.chosen):
+        if chosen.form.signature.fixed is None:
+            G[k, fitted.columns(n)] = -fitted.slopes(n)
+    out[k] -= fitted.stiffening
+    return out, G @ covariance @ G.T
 
 
 def _bread(X: Array) -> Array:
@@ -80,22 +99,25 @@ def _robust(fitted: Fitted, X: Array, bread: Array) -> RobustCovariance:
     return robust_covariance(scores, bread, [int(w.open.sum()) for w in fitted.problem.weights])
 
 
-def _noise_shift(fitted: Fitted, bread: Array) -> Array:
+def _noise_shift(fitted: Fitted) -> Array:
     """What the noise in the columns has moved the coefficients by, taken back."""
     problem, size = fitted.problem, fitted.basis.coefficients.size
     p = len(problem.names)
     normal, right = np.zeros((size, size)), np.zeros(size)
     for seed in NOISE_SEEDS:
-        columns = _noise_rows(problem, seed)
+        target, columns = _noise_rows(problem, seed)
         normal[:p, :p] += columns.T @ columns / len(NOISE_SEEDS)
-        right[:p] += columns.T @ (columns @ fitted.basis.coefficients[:p]) / len(NOISE_SEEDS)
-    # (H - N) b = X'y, for the target is free of this noise; with b = b0 + d: (H - N) d = N b0.
-    reduced = np.linalg.pinv(bread) - normal
-    return np.asarray(np.linalg.lstsq(reduced, right, rcond=1e-12)[0], dtype=np.float64)
+        right[:p] += columns.T @ (columns @ fitted.basis.coefficients[:p] - target) / len(NOISE_SEEDS)
+    # (H - N) b = X'y - n with N, n the noise's part of X'X and X'y; with b = b0 + d: (H - N) d = N b0 - n.
+    X = fitted.basis.columns
+    scale = np.linalg.norm(X, axis=0)
+    scale[scale == 0.0] = 1.0
+    reduced = ((X / scale).T @ (X / scale)) - normal / np.outer(scale, scale)
+    return np.asarray(np.linalg.lstsq(reduced, right / scale, rcond=1e-12)[0] / scale, dtype=np.float64)
 
 
-def _noise_rows(problem: Problem, seed: int) -> Array:
-    """Baseline columns of a record that holds nothing but the encoders' noise."""
+def _noise_rows(problem: Problem, seed: int) -> tuple[Array, Array]:
+    """Target and baseline columns of a record that holds nothing but the encoders' noise."""
     rng = np.random.default_rng(seed)
     noisy = []
     for s in problem.stretches:
@@ -125,9 +147,10 @@ def base_estimates(
             value += float(getattr(problem.base, parameter.symbol))
         stderr = float(np.sqrt(max(result.covariance[k, k], 0.0)))
         unit = unit_of(parameter.quantity, linear=linear, torque_unit=torque_unit)
+        is_split = parameter.quantity in {"viscous", "torque"} and not problem.both
         out.append(
             judge(
-                parameter,
+                replace(parameter, split=is_split),
                 unit,
                 value,
                 stderr,

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import solve
-from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter
+from flexid_cli.diagnose.fitter import Fitted, Fitter, without
 from flexid_cli.diagnose.problem import Problem
+from flexid_cli.diagnose.search import Search
 
 Array = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ def score(fitter: Fitter, fitted: Fitted, k: int, library: int) -> Score:
     from scipy.stats import t as student
 
     chosen = fitted.chosen[k]
-    rest = fitter.fit(fitted.problem, (*fitted.chosen[:k], *fitted.chosen[k + 1 :]), fitted.search)
+    rest = fitter.fit(fitted.problem, without(fitted.chosen, k), fitted.search)
     rows = fitted.search.rows(chosen.form, chosen.shape)
     column = rest.basis.outside(rows) @ fitted.amplitudes(k)
     parts = _blocks(column * rest.basis.residual, fitted.problem, BLOCKS)
@@ -75,8 +76,11 @@ def cross_validated(fitted: Fitted) -> Array:
 
 
 def predicted(problem: Problem, fitter: Fitter, fitted: Fitted) -> Array:
-    """Residual rows of another record with all parameters of ``fitted``; both share one linearisation's names."""
-    there = fitter.fit(problem.at(fitted.problem.base, shift=fitted.problem.shift), fitted.chosen)
+    """Residual rows of another record with all parameters of ``fitted``."""
+    here = fitted.problem
+    other = problem.at(here.base, shift=here.shift, applied=here.applied, stiffening=here.stiffening)
+    held = {c.form: fitted.slopes(k) for k, c in enumerate(fitted.chosen)}
+    there = fitter.fit(other, fitted.chosen, Search(other, fitter.forms, held))
     return np.asarray(there.y - there.basis.columns @ fitted.basis.coefficients)
 
 
@@ -93,8 +97,8 @@ def by_equation(problem: Problem, residual: Array) -> Mapping[str, Array]:
 
 def gains(fitter: Fitter, fitted: Fitted) -> list[float]:
     """What leaving out each effect costs, at the present linearisation."""
-    out = []
-    for k in range(len(fitted.chosen)):
-        rest: tuple[Chosen, ...] = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
-        out.append(float(np.log(fitter.fit(fitted.problem, rest, fitted.search).cost / fitted.cost)))
-    return out
+    rest = [
+        fitter.fit(fitted.problem, without(fitted.chosen, k), fitted.search)
+        for k in range(len(fitted.chosen))
+    ]
+    return [float(np.log(f.cost / fitted.cost)) for f in rest]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,16 @@ class Fitted:
             return np.array([chosen.form.signature.fixed])
         return self.basis.coefficients[self.columns(k)]
 
+    @cached_property
+    def stiffening(self) -> float:
+        """Stiffness of the chosen effects, which K of the columns holds too."""
+        return float(sum(self.amplitudes(k) @ self.slopes(k) for k in range(len(self.chosen))))
+
+    def slopes(self, k: int) -> Array:
+        """Stiffness of the k-th chosen effect for unit amplitudes."""
+        chosen = self.chosen[k]
+        return self.search.slopes(chosen.form, chosen.shape)
+
     def columns(self, k: int) -> slice:
         """Where the columns of the k-th chosen effect stand; it has a free amplitude."""
         first = len(self.problem.names)
@@ -112,7 +123,12 @@ class Fitter:
         best = fitted
         for _ in range(rounds):
             base = self._widths(fitted, self.moved(fitted))
-            moved = problem.at(base, shift=self._shift(fitted), applied=self._errors(fitted))
+            moved = problem.at(
+                base,
+                shift=self._shift(fitted),
+                applied=self._errors(fitted),
+                stiffening=fitted.stiffening,
+            )
             fitted = self._shapes(self.fit(moved, fitted.chosen))
             gained = best.loss - fitted.loss
             best = fitted if gained > 0.0 else best
@@ -132,7 +148,8 @@ class Fitter:
     @staticmethod
     def moved(fitted: Fitted) -> Base:
         """The baseline that a fit gives."""
-        return fitted.problem.moved(fitted.basis.coefficients[: len(fitted.problem.names)])
+        names = fitted.problem.names
+        return fitted.problem.moved(fitted.basis.coefficients[: len(names)], fitted.stiffening)
 
     def _widths(self, fitted: Fitted, base: Base) -> Base:
         """Reversal widths by golden section; only the Coulomb column changes with them."""
@@ -173,21 +190,21 @@ class Fitter:
         for k, c in enumerate(fitted.chosen):
             if not fitted.search.shapes(c.form):
                 continue
-            rest = self.fit(fitted.problem, _without(fitted.chosen, k), fitted.search)
+            rest = self.fit(fitted.problem, without(fitted.chosen, k), fitted.search)
             best = fitted.search.refine(fitted.search.evaluate(c.form, c.shape, rest.basis), rest.basis)
             chosen = (*fitted.chosen[:k], Chosen(c.form, best.shape), *fitted.chosen[k + 1 :])
             fitted = self.fit(fitted.problem, chosen, fitted.search)
         return fitted
 
-    def candidates(self, fitted: Fitted, without: int | None = None) -> list[Candidate]:
+    def candidates(self, fitted: Fitted, instead_of: int | None = None) -> list[Candidate]:
         """The best form of every effect that is not in the model, best first, refused ones last.
 
-        ``without`` takes one of the model's effects out before: what could stand in its place (itself included).
+        ``instead_of`` takes one of the model's effects out before: what could stand in its place (itself included).
         """
         now = (
             fitted
-            if without is None
-            else self.fit(fitted.problem, _without(fitted.chosen, without), fitted.search)
+            if instead_of is None
+            else self.fit(fitted.problem, without(fitted.chosen, instead_of), fitted.search)
         )
         taken = {c.name for c in now.chosen}
         forms = [f for f in self.forms if f.name not in taken]
@@ -200,5 +217,6 @@ class Fitter:
         return sorted(by_name.values(), key=lambda c: c.rank)
 
 
-def _without(chosen: Sequence[Chosen], k: int) -> tuple[Chosen, ...]:
+def without(chosen: Sequence[Chosen], k: int) -> tuple[Chosen, ...]:
+    """All chosen effects but the k-th."""
     return (*chosen[:k], *chosen[k + 1 :])

@@ -157,7 +157,7 @@ def _map(problem: Problem, now: Basis, equation: str, variable: str) -> Map:
     def terms(m: Motion) -> Terms:
         return Terms(**{equation: hats(value(m, equation), knots) * factor(m, equation)[:, None]})
 
-    C = problem.effect_rows(terms)
+    C, _ = problem.effect_rows(terms)
     if factor is _torque:
         # The torque is what is explained: only how its factor varies is free, not the factor itself.
         weight = hats(x, knots).mean(axis=0)
@@ -198,26 +198,36 @@ def _line(problem: Problem, now: Basis, equation: str) -> Map:
     k = 0 if equation == "motor" or not problem.both else 1
     rows = problem.row_times.size
     e = now.residual.reshape(-1, rows)[k]
-    t = problem.row_times
-    grid = np.arange(0.2, 0.95 * problem.band_hz, 0.4 / max(t[-1] - t[0], 1.0))
-    # Rows come at twice the band: uniform within a stretch.
-    power = np.abs(_transform(e, t, grid)) ** 2
-    best = float(grid[int(np.argmax(power))])
+    span = float(np.ptp(problem.row_times))
+    grid = np.arange(0.2, 0.95 * problem.band_hz, 0.4 / max(span, 1.0))
+    best = float(grid[int(np.argmax(np.abs(_transform(problem, e, grid))))])
 
     def terms(m: Motion) -> Terms:
         w = 2.0 * np.pi * best * m.time_s
         return Terms(**{equation: np.column_stack([np.cos(w), np.sin(w)])})
 
-    gain, values, errors = _explained(problem.effect_rows(terms), now)
+    gain, values, errors = _explained(problem.effect_rows(terms)[0], now)
     size = np.array([float(np.hypot(*values))])
     return Map(equation, "frequency", gain, np.array([best]), size, errors[:1], True)
 
 
-def _transform(e: Array, t: Array, grid: Array) -> NDArray[np.complex128]:
-    """Fourier sums of ``e`` at the frequencies of the grid, a few at a time."""
-    out = np.zeros(grid.size, dtype=np.complex128)
-    for k in range(0, grid.size, 64):
-        out[k : k + 64] = np.exp(-2j * np.pi * np.outer(grid[k : k + 64], t)) @ e
+def _transform(problem: Problem, e: Array, grid: Array) -> NDArray[np.complex128]:
+    """Fourier sums of the rows ``e`` of one equation at a uniform grid of frequencies."""
+    from scipy.signal import czt
+
+    out, first = np.zeros(grid.size, dtype=np.complex128), 0
+    for s, w in zip(problem.stretches, problem.weights, strict=True):
+        # Rows are uniform within a stretch.
+        count, step = w.seconds.size, float(w.seconds[1] - w.seconds[0])
+        turn = -2j * np.pi * step
+        sums = czt(
+            e[first : first + count],
+            grid.size,
+            np.exp(turn * (grid[1] - grid[0])),
+            np.exp(-turn * grid[0]),
+        )
+        out += sums * np.exp(-2j * np.pi * grid * (s.start_s + w.seconds[0]))
+        first += count
     return out
 
 

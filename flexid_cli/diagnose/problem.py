@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,7 +37,10 @@ SHORTEST_S = 2.0
 MODEL_FLOOR = 0.001
 ASTRAY = 1.6
 BOTH_NAMES = ("Jm", "FVm", "FSm", "K", "c", "JL", "FV", "FS", "MX", "MY")
-SHARED = 2  # K and c stand in both equations
+SHARED = 1  # c, the spring's torque at its zero, stands in both equations
+SPRING_ALONE = 1e-3  # share of an effect of the transmission outside of a spring that can be anything
+PROBE_SEED, LEAST_PROBE = 20010523, 1e-4  # of the torsion's standard deviation
+SCALED = ("JL", "FV", "FS", "MX", "MY")  # both encoders: times K at the linearisation over K
 ALONE_NAMES = ("Jm", "FVm", "FSm", "K", "JL", "FV", "FS")
 
 
@@ -103,6 +107,12 @@ class Stretch:
 class Problem:
     """Baseline columns, measurement and effect columns of one record, linearised at ``base``.
 
+    With both encoders the load equation is one for the torsion, 0 = K0 (qm - q) - (K0 / K) (JL q'' + ...): as it
+    stands, whatever it lacks would draw K and all load parameters to zero together, for there it is fulfilled too.
+    K0 is the stiffness at the linearisation, so that effects have one amplitude in both equations. For the same
+    reason what a transmission effect has in common with a spring is left to K, which then is the stiffness of both
+    together.
+
     Parameters
     ----------
     stretches : sequence of Stretch
@@ -124,6 +134,8 @@ class Problem:
         Whether the linearisation began at an estimate that can be trusted.
     shift : float
         Periods by which the torque acts later than its stamp says: half a one where it is held unsaid.
+    stiffening : float
+        Stiffness of the effects that the linearisation holds, beside that of ``base``.
     """
 
     def __init__(
@@ -141,11 +153,13 @@ class Problem:
         applied: Mapping[Form, Array] | None = None,
         anchor: Base | None = None,
         settled: bool = True,
+        stiffening: float = 0.0,
     ) -> None:
-        self.stretches, self.base, self.noise, self.band_hz = stretches, base, noise, band_hz
+        self.stretches, self.noise, self.band_hz = stretches, noise, band_hz
+        self.base = replace(base, gear_ratio=gear_ratio)
         self.gravity, self.gear_ratio, self.duration_s = gravity, gear_ratio, duration_s
         self.both, self.shift, self.anchor = both, shift, anchor
-        self.settled = settled
+        self.settled, self.stiffening = settled, stiffening
         self.applied: Mapping[Form, Array] = applied or {}
         self.recorded = stretches
         self.names = BOTH_NAMES if both else ALONE_NAMES
@@ -156,7 +170,12 @@ class Problem:
         self.motions = [self._motion(s) for s in stretches]
 
     def at(
-        self, base: Base, *, shift: float | None = None, applied: Mapping[Form, Array] | None = None
+        self,
+        base: Base,
+        *,
+        shift: float | None = None,
+        applied: Mapping[Form, Array] | None = None,
+        stiffening: float | None = None,
     ) -> Problem:
         """The same record linearised elsewhere, with other errors of the joint's position taken out."""
         stretches = self.stretches
@@ -175,6 +194,7 @@ class Problem:
             applied=self.applied if applied is None else applied,
             anchor=self.anchor,
             settled=self.settled,
+            stiffening=self.stiffening if stiffening is None else stiffening,
         )
         other.recorded = self.recorded
         return other
@@ -184,6 +204,11 @@ class Problem:
         """Time of each row, s."""
         parts = [s.start_s + w.seconds for s, w in zip(self.stretches, self.weights, strict=True)]
         return np.concatenate(parts)
+
+    @property
+    def stiffness(self) -> float:
+        """Stiffness of the spring and of what effects add to it, at the linearisation."""
+        return self.base.K + self.stiffening
 
     @property
     def equations(self) -> int:
@@ -266,7 +291,8 @@ class Problem:
     def target(self, *, shift: float | None = None) -> Array:
         """What the columns are to explain, shape (r,).
 
-        Both encoders: the torque. Motor alone: the misfit of eq. (18) at the linearisation.
+        Both encoders: the torque, and the spring's torque at the linearisation. Motor alone: the misfit of eq. (18)
+        at the linearisation.
         """
         late = self.shift if shift is None else shift
 
@@ -274,7 +300,7 @@ class Problem:
             torque = s.torque if self.both else self.through(s, s.torque)
             spectrum = _later(s, s.spectrum(torque), late)
             if self.both:
-                return [spectrum, None]
+                return [spectrum, s.spectrum(self._spring(s))]
             b = self.base
             acceleration, velocity = s.derivative(s.motor, 2), s.derivative(s.motor, 1)
             motor = b.Jm * acceleration + b.FVm * velocity + b.FSm * m.motor_sign
@@ -282,6 +308,9 @@ class Problem:
             return [spectrum - s.spectrum(self.through(s, motor) + load)]
 
         return self._rows(part)[:, 0]
+
+    def _spring(self, s: Stretch) -> Array:
+        return self.stiffness * (s.motor - s.joint - self.base.torsion_zero)
 
     def signal(self) -> float:
         """RMS of the torque in the whitened rows of the motor equation: how far it stands above its noise."""
@@ -296,16 +325,15 @@ class Problem:
         """Rows of the baseline's columns, in the order of ``names``."""
         return self._rows(self._base_both if self.both else self._base_alone)
 
-    def _base_both(self, s: Stretch, m: Motion) -> list[Complex | None]:
-        one = np.ones(s.torque.size)
-        torsion = s.motor - s.joint
+    def _base_both(self, s: Stretch, m: Motion) -> list[Complex]:
+        one, torsion = np.ones(s.torque.size), s.motor - s.joint - self.base.torsion_zero
         motor = [s.derivative(s.motor, 2), s.derivative(s.motor, 1), m.motor_sign, torsion, one]
-        load = [-torsion, -one, s.derivative(s.joint, 2), s.derivative(s.joint, 1), m.joint_sign]
+        load = [-one, s.derivative(s.joint, 2), s.derivative(s.joint, 1), m.joint_sign]
         load += [self.gravity * np.cos(m.joint_position), self.gravity * np.sin(m.joint_position)]
         return self._side_by_side(s, motor, load)
 
     @staticmethod
-    def _side_by_side(s: Stretch, motor: Sequence[Array], load: Sequence[Array]) -> list[Complex | None]:
+    def _side_by_side(s: Stretch, motor: Sequence[Array], load: Sequence[Array]) -> list[Complex]:
         """Columns of both equations; the last of the motor's are the first of the load's."""
         M, L = s.spectrum(np.column_stack(motor)), s.spectrum(np.column_stack(load))
         own = len(load) - SHARED, len(motor) - SHARED
@@ -342,27 +370,85 @@ class Problem:
 
         return self._rows(part)[:, 0]
 
-    def noise_rows(self, noisy: Sequence[Stretch]) -> Array:
-        """Baseline columns of stretches of pure noise, weighted as this record's (both encoders).
+    def noise_rows(self, noisy: Sequence[Stretch]) -> tuple[Array, Array]:
+        """Target and baseline columns of stretches of pure noise, weighted as this record's (both encoders).
 
-        Signs, gravity and constants are not linear in the noise and stay zero.
+        Signs, gravity and constants are not linear in the noise and stay zero. Shapes (r,) and (r, p).
         """
 
         def part(s: Stretch) -> list[Complex | None]:
             zero = np.zeros(s.torque.size)
-            torsion = s.motor - s.joint
-            motor = [s.derivative(s.motor, 2), s.derivative(s.motor, 1), zero, torsion, zero]
-            load = [-torsion, zero, s.derivative(s.joint, 2), s.derivative(s.joint, 1), zero, zero, zero]
-            return self._side_by_side(s, motor, load)
+            motor = [s.derivative(s.motor, 2), s.derivative(s.motor, 1), zero, s.motor - s.joint, zero]
+            load = [zero, s.derivative(s.joint, 2), s.derivative(s.joint, 1), zero, zero, zero]
+            M, L = self._side_by_side(s, motor, load)
+            spring = s.spectrum(self.stiffness * (s.motor - s.joint))
+            return [np.hstack([np.zeros_like(spring), M]), np.hstack([spring, L])]
 
         parts = [w.apply(part(s)) for s, w in zip(noisy, self.weights, strict=True)]
         stacked = np.concatenate(parts, axis=1)
-        return stacked.reshape(-1, stacked.shape[-1])
+        rows = stacked.reshape(-1, stacked.shape[-1])
+        return rows[:, 0], rows[:, 1:]
 
-    def effect_rows(self, terms_of: Callable[[Motion], Terms]) -> Array:
-        """Rows of what an effect adds, shape (r, k)."""
-        place = self._place_both if self.both else self._place_alone
-        return self._rows(lambda s, m: place(s, terms_of(m)))
+    def effect_rows(
+        self, terms_of: Callable[[Motion], Terms], slopes: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Rows of what an effect adds, shape (r, k), without the spring in it, and its stiffness, shape (k,).
+
+        Both for unit amplitudes; with ``slopes`` a spring of that stiffness is left out, not the effect's own.
+        """
+        seen: list[Terms] = []
+
+        def part(s: Stretch, m: Motion) -> list[Complex | None]:
+            seen.append(terms_of(m))
+            return (self._place_both if self.both else self._place_alone)(s, seen[-1])
+
+        rows = self._rows(part)
+        if not self.both or seen[0].transmission is None:
+            return rows, np.zeros(rows.shape[1])
+        slopes = self._slopes(terms_of, seen) if slopes is None else slopes
+        return self._without_spring(rows, slopes), slopes
+
+    def _slopes(self, terms_of: Callable[[Motion], Terms], seen: Sequence[Terms]) -> Array:
+        """Mean answer of a transmission effect to a little more torsion, shape (k,).
+
+        Noise of the torsion, which is most of what the load equation leaves, passes the effect with this stiffness.
+        """
+        answer, size = np.zeros(1), 0.0
+        for (probe, moved), terms in zip(self._probed, seen, strict=True):
+            other = terms_of(moved).transmission
+            if other is not None and terms.transmission is not None:
+                answer = answer + probe @ (other - terms.transmission)
+                size += float(probe @ probe)
+        return np.asarray(answer / size, dtype=np.float64)
+
+    @cached_property
+    def _probed(self) -> list[tuple[Array, Motion]]:
+        """Noise of the size of the encoders' (at least) for each stretch, and the motion with it in the torsion."""
+        rng, out = np.random.default_rng(PROBE_SEED), []
+        for s, m in zip(self.stretches, self.motions, strict=True):
+            probe = s.lowpass(rng.standard_normal(m.deflection.size), SMOOTH_BAND)
+            noise = float(np.hypot(self.noise.motor_position, self.noise.joint_position))
+            size = max(noise * probe.std(), LEAST_PROBE * float(np.std(m.deflection)))
+            probe = size / probe.std() * probe
+            moved = replace(
+                m,
+                deflection=m.deflection + probe,
+                deflection_rate=m.deflection_rate + s.derivative(probe, 1),
+            )
+            out.append((probe, moved))
+        return out
+
+    def _without_spring(self, rows: Array, slopes: Array) -> Array:
+        left = rows - np.outer(self._torsion, slopes)
+        # What is a spring and no more is nothing at all, not the rounding errors of the difference.
+        nothing = np.linalg.norm(left, axis=0) < SPRING_ALONE * np.linalg.norm(rows, axis=0)
+        left[:, nothing] = 0.0
+        return np.asarray(left, dtype=np.float64)
+
+    @cached_property
+    def _torsion(self) -> Array:
+        """Rows of a spring of unit stiffness, shape (r,)."""
+        return self._rows(lambda s, m: self._place_both(s, Terms(transmission=m.deflection[:, None])))[:, 0]
 
     def _place_both(self, s: Stretch, t: Terms) -> list[Complex | None]:
         b = self.base
@@ -451,17 +537,21 @@ class Problem:
             base=b,
         )
 
-    def moved(self, coefficients: Array) -> Base:
-        """The baseline that a solution for the base columns gives.
+    def moved(self, coefficients: Array, stiffening: float = 0.0) -> Base:
+        """The baseline that a solution for the base columns gives beside effects with a ``stiffening``.
 
         The motor alone is solved for steps, which are kept short: the equation is linear only nearby.
         """
         v = dict(zip(self.names, (float(x) for x in coefficients), strict=True))
         b = self.base
         if self.both:
+            v |= {n: v[n] * v["K"] / self.stiffness for n in SCALED if v["K"] > 0.0}
+            v["K"] -= stiffening
             new = {n: v[n] for n in ("FVm", "FSm", "FV", "FS")}
             strong = {n: v[n] if v[n] > 0.05 * getattr(b, n) else getattr(b, n) for n in ("Jm", "K", "JL")}
-            return replace(b, **new, **strong, torsion_zero=-v["c"] / strong["K"])
+            return replace(
+                b, **new, **strong, torsion_zero=b.torsion_zero - v["c"] / (strong["K"] + stiffening)
+            )
         strong = {
             n: getattr(b, n) * float(np.clip(1.0 + v[n] / getattr(b, n), 0.7, 1.4)) for n in ("Jm", "K", "JL")
         }

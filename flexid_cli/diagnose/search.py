@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +17,13 @@ from flexid_cli.effects.signature import Scale, Signature
 Array = NDArray[np.float64]
 
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-GOLDEN_STEPS = 7
+TRIED_STEPS, REFINED_STEPS = 7, 10  # of a golden section: for a candidate, and for an effect of the model
 PEAKS = 5  # of a search over cycles that are looked at exactly
 NORMS = 16  # cycles at which a ripple's size in the rows is worked out
 DEPENDENT = 1e-7  # a column with less than this share outside the model's is the model's
 CACHED = 4000
+# Range of K beside an effect, as a share of the stiffness of both together.
+LEAST_SPRING, MOST_SPRING = 0.1, 10.0
 
 
 @dataclass(frozen=True)
@@ -81,22 +83,33 @@ class Search:
     problem : Problem
     forms : sequence of Form
         That this record could show.
+    held : mapping of Form to ndarray, optional
+        Stiffness of effects that another record's K holds, in place of this record's own.
     """
 
-    def __init__(self, problem: Problem, forms: Sequence[Form]) -> None:
-        self.problem, self.forms = problem, forms
+    def __init__(
+        self, problem: Problem, forms: Sequence[Form], held: Mapping[Form, Array] | None = None
+    ) -> None:
+        self.problem, self.forms, self._held = problem, forms, held or {}
         self.scale: Scale = problem.scale()
         self.target = problem.target()
         self.base = problem.base_rows()
-        self._rows: dict[tuple[Form, tuple[float, ...]], Array] = {}
+        self._rows: dict[tuple[Form, tuple[float, ...]], tuple[Array, Array]] = {}
         self._norms: dict[str, tuple[Array, Array]] = {}
 
     def rows(self, form: Form, shape: tuple[float, ...]) -> Array:
         """Whitened columns of a form for unit amplitudes."""
+        return self._made(form, shape)[0]
+
+    def slopes(self, form: Form, shape: tuple[float, ...]) -> Array:
+        """Stiffness that a form has for unit amplitudes, shape (k,)."""
+        return self._made(form, shape)[1]
+
+    def _made(self, form: Form, shape: tuple[float, ...]) -> tuple[Array, Array]:
         key = (form, shape)
         found = self._rows.get(key)
         if found is None:
-            found = self.problem.effect_rows(lambda m: form.signature.columns(m, shape))
+            found = self.problem.effect_rows(lambda m: form.signature.columns(m, shape), self._held.get(form))
             if len(self._rows) > CACHED:
                 self._rows.clear()
             self._rows[key] = found
@@ -118,7 +131,7 @@ class Search:
             return Candidate(form, shape, np.array([signature.fixed]), before, float(e @ e))
         P = now.outside(C)
         norm = np.linalg.norm(P, axis=0)
-        if not np.all(norm > DEPENDENT * np.linalg.norm(C, axis=0)):
+        if not np.all(norm > DEPENDENT * np.maximum(np.linalg.norm(C, axis=0), 1e-300)):
             return Candidate(
                 form, shape, np.zeros(C.shape[1]), before, before, "its columns depend on the model's"
             )
@@ -130,6 +143,9 @@ class Search:
             return Candidate(
                 form, shape, amplitudes, before, before, "physics forbids the sign that the fit gives it"
             )
+        stiffening = float(amplitudes @ self.slopes(form, shape))
+        if not LEAST_SPRING < 1.0 - stiffening / self.problem.stiffness < MOST_SPRING:
+            return Candidate(form, shape, amplitudes, before, before, "it would take the spring's place")
         refused = "" if signature.tied is None else signature.tied(amplitudes, shape, self.problem.base)
         return Candidate(form, shape, amplitudes, before, cost, refused)
 
@@ -140,7 +156,7 @@ class Search:
             return None
         points = self._ripples(form, shapes[0], now) if form.signature.ripple else _grid(shapes)
         best = min((self.evaluate(form, p, now) for p in points), key=lambda c: c.rank)
-        return best if not shapes or best.refused else self.refine(best, now)
+        return best if not shapes or best.refused else self.refine(best, now, TRIED_STEPS)
 
     def _ripples(self, form: Form, shape: Shape, now: Basis) -> list[tuple[float, ...]]:
         """Cycles at which a ripple over the motor's angle would explain most, by one transform over all of them."""
@@ -167,7 +183,7 @@ class Search:
             self._norms[form.name] = some, np.asarray(norms)
         return np.maximum(np.interp(cycles, *self._norms[form.name]), 1e-300)
 
-    def refine(self, best: Candidate, now: Basis) -> Candidate:
+    def refine(self, best: Candidate, now: Basis, sections: int = REFINED_STEPS) -> Candidate:
         """Golden section along each shape parameter in turn, between the neighbours of the best point."""
         shapes = self.shapes(best.form)
         if not shapes:
@@ -175,11 +191,11 @@ class Search:
         steps = [_step(s) for s in shapes]
         for _ in range(2 if len(shapes) > 1 else 1):
             for k, s in enumerate(shapes):
-                best = self._along(best, k, s, steps[k], now)
+                best = self._along(best, k, s, steps[k], now, sections)
                 steps[k] *= 0.3
         return best
 
-    def _along(self, best: Candidate, k: int, s: Shape, step: float, now: Basis) -> Candidate:
+    def _along(self, best: Candidate, k: int, s: Shape, step: float, now: Basis, sections: int) -> Candidate:
         to, back = (np.log, np.exp) if s.spacing == "log" else (float, float)
         centre = float(to(best.shape[k]))
         low, high = max(centre - step, float(to(s.low))), min(centre + step, float(to(s.high)))
@@ -190,7 +206,7 @@ class Search:
             found.append(self.evaluate(best.form, shape, now))
             return found[-1].cost
 
-        golden(cost, low, high, GOLDEN_STEPS)
+        golden(cost, low, high, sections)
         return min(found, key=lambda c: c.rank)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter
+from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter, without
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.search import Candidate
 
@@ -35,8 +35,6 @@ class Selection:
         Every effect against the baseline.
     rivals : tuple of tuple of (str, float)
         Names of the other effects tried in place of each chosen one, and what they are worse by.
-    left : tuple of Candidate
-        Effects against what the chosen ones leave.
     """
 
     before: Fitted
@@ -44,7 +42,6 @@ class Selection:
     alternatives: tuple[tuple[Fitted, ...], ...]
     tested: tuple[Candidate, ...]
     rivals: tuple[tuple[tuple[str, float], ...], ...]
-    left: tuple[Candidate, ...]
 
 
 def select(fitter: Fitter, problem: Problem) -> Selection:
@@ -60,7 +57,7 @@ def select(fitter: Fitter, problem: Problem) -> Selection:
         fitted = _needed(fitter, new, enough)
         found = fitter.candidates(fitted)
     alternatives, rivals = _alternatives(fitter, fitted)
-    return Selection(before, fitted, alternatives, tuple(tested), rivals, tuple(found))
+    return Selection(before, fitted, alternatives, tuple(tested), rivals)
 
 
 def threshold(problem: Problem) -> float:
@@ -85,11 +82,11 @@ def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted | N
 def _needed(fitter: Fitter, fitted: Fitted, enough: float) -> Fitted:
     """Leave out effects that the others have made needless."""
     while len(fitted.chosen) > 1:
-        without = [
-            fitter.fit(fitted.problem, (*fitted.chosen[:k], *fitted.chosen[k + 1 :]), fitted.search)
+        smaller = [
+            fitter.fit(fitted.problem, without(fitted.chosen, k), fitted.search)
             for k in range(len(fitted.chosen))
         ]
-        weakest = min(without, key=lambda f: f.cost)
+        weakest = min(smaller, key=lambda f: f.cost)
         if np.log(weakest.cost / fitted.cost) > enough:
             break
         fitted = fitter.relax(fitted.problem, weakest.chosen, rounds=1)
@@ -102,10 +99,10 @@ def _alternatives(
     """What explains the record as well in place of each chosen effect."""
     alternatives, rivals = [], []
     for k, chosen in enumerate(fitted.chosen):
-        others = [c for c in fitter.candidates(fitted, without=k) if c.form.name != chosen.name]
+        others = [c for c in fitter.candidates(fitted, instead_of=k) if c.form.name != chosen.name]
         worse = [(c.form.name, float(np.log(c.cost / fitted.cost))) for c in others]
         near = [c for c, (_, w) in zip(others, worse, strict=True) if w < LOOKED_AT and not c.refused]
-        rest = (*fitted.chosen[:k], *fitted.chosen[k + 1 :])
+        rest = without(fitted.chosen, k)
         refits = [fitter.relax(fitted.problem, (*rest, Chosen(c.form, c.shape)), rounds=2) for c in near]
         alternatives.append(tuple(f for f in refits if f.loss - fitted.loss < AS_GOOD))
         rivals.append(tuple(sorted(worse, key=lambda w: w[1])))

@@ -30,7 +30,7 @@ def simulation_error(
     quantity = "joint_position" if problem.both else "torque"
     try:
         first = _error(problem, stretch, before, ())
-        second = _error(problem, stretch, after, effects) if effects else first
+        second = _error(problem, stretch, after, effects) if effects or after != before else first
     except FlexidError as error:
         return SimulationError(None, None, quantity, unit, error.message)
     return SimulationError(first, second, quantity, position_unit if problem.both else unit)

@@ -106,7 +106,7 @@ def _both_base(stretches: list[Stretch], width: float) -> Base:
         )
     M, L = np.vstack(motor), np.vstack(load)
     Jm, K, FVm, FSm, _ = solve(M[:, 1:], M[:, 0]).coefficients
-    inertia, viscous, coulomb, *_ = solve(L[:, 1:], L[:, 0]).coefficients
+    inertia, viscous, coulomb, zero, *_ = solve(L[:, 1:], L[:, 0]).coefficients
     if not (Jm > 0.0 and K > 0.0 and inertia > 0.0):
         raise DataError(
             "the motor and joint positions do not show a flexible axis: inertia or stiffness come out negative",
@@ -115,7 +115,7 @@ def _both_base(stretches: list[Stretch], width: float) -> Base:
         )
     return Base(
         Jm=float(Jm), K=float(K), JL=float(K * inertia), FVm=float(FVm), FSm=float(FSm), FV=float(K * viscous),
-        FS=float(K * coulomb), motor_reversal=width, load_reversal=width,
+        FS=float(K * coulomb), motor_reversal=width, load_reversal=width, torsion_zero=float(zero),
     )  # fmt: skip
 
 

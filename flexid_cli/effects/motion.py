@@ -22,6 +22,8 @@ class Base:
         Widths v0 of sgn v = tanh(v / v0).
     torsion_zero : float
         Difference of the encoders where the spring carries nothing.
+    gear_ratio : float
+        Motor angle over joint angle.
     """
 
     Jm: float
@@ -34,6 +36,7 @@ class Base:
     motor_reversal: float
     load_reversal: float
     torsion_zero: float = 0.0
+    gear_ratio: float = 1.0
 
 
 @dataclass(frozen=True)

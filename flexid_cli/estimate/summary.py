@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,10 @@ DERIVED = (
     Parameter("resonance", "f1", "frequency"),
     Parameter("antiresonance", "fa", "frequency"),
     Parameter("inertia_ratio", "JL/Jm", "ratio"),
+)
+SUMS = (
+    (Parameter("viscous_friction", "FVm + FV", "viscous"), ("FVm", "FV")),
+    (Parameter("coulomb_friction", "FSm + FS", "torque"), ("FSm", "FS")),
 )
 SIGNIFICANT_DELAY_SAMPLES = 0.1
 SIGNIFICANT_SIGMA = 3.0
@@ -278,30 +282,42 @@ def fitted_resonance(model: Model, theta: Array) -> float | None:
 
 
 def _derived(solution: Solution, config: Config, uncertainty: Uncertainty) -> tuple[Estimate, ...]:
-    """Resonance, antiresonance and inertia ratio by the delta method, where they exist."""
-    symbols = [p.symbol for p in solution.model.parameters]
+    """Quantities that are functions of the parameters, where they exist, by the delta method."""
+    symbols = tuple(p.symbol for p in solution.model.parameters)
     if "K" not in symbols:
         return ()
-    index = [symbols.index(s) for s in ("Jm", "K", "JL")]
-    if set(index) & set(solution.result.dependent):
-        return ()
-    Jm, K, JL = (float(x) for x in solution.reported.theta[index])
-    covariance = uncertainty.covariance[np.ix_(index, index)]
-    dof = float(np.min(uncertainty.degrees_of_freedom[index]))
+    theta = solution.reported.theta
+    values = dict(zip(symbols, (float(x) for x in theta), strict=True))
     found = []
-    for parameter, square, gradient in (
-        (DERIVED[0], K / Jm + K / JL, np.array([-K / Jm**2, 1.0 / Jm + 1.0 / JL, -K / JL**2])),
-        (DERIVED[1], K / JL, np.array([0.0, 1.0 / JL, -K / JL**2])),
+    for parameter, value, slopes in (*_resonances(values), *_sums(solution.model, values)):
+        index = [symbols.index(s) for s in slopes]
+        if not set(index) & set(solution.result.dependent):
+            g = np.array(list(slopes.values()))
+            stderr = float(np.sqrt(g @ uncertainty.covariance[np.ix_(index, index)] @ g))
+            dof = float(np.min(uncertainty.degrees_of_freedom[index]))
+            found.append(_judge(solution, config, parameter, value, stderr, dof))
+    return tuple(found)
+
+
+def _resonances(v: Mapping[str, float]) -> Iterator[tuple[Parameter, float, Mapping[str, float]]]:
+    """Resonance, antiresonance and inertia ratio: parameter, value and its derivatives by symbol."""
+    Jm, K, JL = v["Jm"], v["K"], v["JL"]
+    for parameter, square, slopes in (
+        (DERIVED[0], K / Jm + K / JL, {"Jm": -K / Jm**2, "K": 1.0 / Jm + 1.0 / JL, "JL": -K / JL**2}),
+        (DERIVED[1], K / JL, {"Jm": 0.0, "K": 1.0 / JL, "JL": -K / JL**2}),
     ):
         if square > 0.0:
             frequency = float(np.sqrt(square)) / (2.0 * np.pi)
-            g = gradient * 0.5 * frequency / square
-            found.append((parameter, frequency, g))
-    found.append((DERIVED[2], JL / Jm, np.array([-JL / Jm**2, 0.0, 1.0 / Jm])))
-    return tuple(
-        _judge(solution, config, parameter, value, float(np.sqrt(g @ covariance @ g)), dof)
-        for parameter, value, g in found
-    )
+            yield parameter, frequency, {s: x * 0.5 * frequency / square for s, x in slopes.items()}
+    yield DERIVED[2], JL / Jm, {"Jm": -JL / Jm**2, "K": 0.0, "JL": 1.0 / Jm}
+
+
+def _sums(model: Model, v: Mapping[str, float]) -> Iterator[tuple[Parameter, float, Mapping[str, float]]]:
+    """Friction of motor and load together, where a model hardly tells one from the other."""
+    split = {p.symbol for p in model.parameters if p.split}
+    for parameter, (motor, load) in SUMS:
+        if {motor, load} <= split:
+            yield parameter, v[motor] + v[load], {motor: 1.0, load: 1.0}
 
 
 def _correlation(covariance: Array) -> Array:

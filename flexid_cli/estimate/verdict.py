@@ -19,6 +19,7 @@ IDENTIFIED_PERCENT = 10.0
 WEAK_PERCENT = 50.0
 NAMED_CORRELATION = 0.9
 FORBIDDEN = "physics forbids a negative value"
+SPLIT = "the motor encoder alone shows the sum of motor and load friction, hardly how it is split"
 
 
 def judge(
@@ -86,6 +87,8 @@ def _verdict(
     half = 0.5 * (interval.high - interval.low)
     if 100.0 * half > WEAK_PERCENT * abs(value):
         return "weak", "a short part of the record carries it, so its interval is wide" + because
+    if parameter.split:
+        return "weak", SPLIT + because
     return "identified", ""
 
 

@@ -29,6 +29,8 @@ class Parameter:
         Physics forbids a negative value.
     effect : str
         Name of the effect that this parameter belongs to where it is beyond the declared baseline.
+    split : bool
+        Only its sum with another parameter stands firmly in the model's equation.
     """
 
     name: str
@@ -36,6 +38,7 @@ class Parameter:
     quantity: str
     positive: bool = False
     effect: str = ""
+    split: bool = False
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,10 @@ PHYSICAL = (
     Parameter("motor_inertia", "Jm", "inertia", positive=True),
     Parameter("joint_stiffness", "K", "stiffness", positive=True),
     Parameter("load_inertia", "JL", "inertia", positive=True),
-    Parameter("motor_viscous_friction", "FVm", "viscous", positive=True),
-    Parameter("load_viscous_friction", "FV", "viscous", positive=True),
-    Parameter("motor_coulomb_friction", "FSm", "torque", positive=True),
-    Parameter("load_coulomb_friction", "FS", "torque", positive=True),
+    Parameter("motor_viscous_friction", "FVm", "viscous", positive=True, split=True),
+    Parameter("load_viscous_friction", "FV", "viscous", positive=True, split=True),
+    Parameter("motor_coulomb_friction", "FSm", "torque", positive=True, split=True),
+    Parameter("load_coulomb_friction", "FS", "torque", positive=True, split=True),
 )
 _COLUMNS = (
     ("torque", 0), ("torque", 2), ("torque", 1),

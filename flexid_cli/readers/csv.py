@@ -135,7 +135,7 @@ class CsvReader:
         damage = [account.damage() for account in accounts]
         for number, (table, part) in enumerate(zip(tables, parts, strict=True)):
             if not table.has_checksum or damage[number].reasons:
-                part.doubt(channels.values())
+                part.doubt(channels.values(), options.threads)
                 damage[number] = part.count(damage[number])
         total = next(iter(columns.values())).size if columns else 0
         marks = suspect_samples(parts, total)

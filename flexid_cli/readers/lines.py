@@ -13,7 +13,7 @@ from flexid_cli.readers.dialect import Dialect, is_whole, split_line
 from flexid_cli.readers.packed import Fault
 
 T = TypeVar("T")
-_BLOCK = 1 << 20  # bytes of text parsed at once; the parser takes longer with less, and more memory with more
+_BLOCK = 5 << 19  # bytes of text parsed at once; the parser takes longer with less, and more memory with more
 _CHECKED = 1 << 18  # bytes that are worth a block of their own
 _LONGEST_LINE = 1 << 20
 _TAIL = 1 << 12  # bytes of the last lines, to judge the very last by
@@ -185,7 +185,9 @@ def in_order(
                 waiting.append(item)
             else:
                 waiting.append(_Ahead(item, pool.submit(parse, item.text)))
-            while len(waiting) >= threads:
+            while (
+                len(waiting) > threads
+            ):  # one more than are parsed, so that no thread has to wait for the next
                 yield _next(waiting, parse)
         while waiting:
             yield _next(waiting, parse)

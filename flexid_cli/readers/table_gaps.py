@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -44,11 +45,13 @@ class TablePart:
     doubts: list[int] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
 
-    def doubt(self, columns: Iterable[RawChannel]) -> None:
+    def doubt(self, columns: Iterable[RawChannel], threads: int | None = None) -> None:
         """Look for samples that physics does not allow in columns that no checksum covers."""
         found: set[int] = set()
-        for column in columns:
-            places = lone_jumps_in_parts(_finite(column.values[self.first : self.end])) + self.first
+        judged = list(columns)
+        with ThreadPoolExecutor(threads) as pool:
+            jumps = list(pool.map(self._jumps, judged))
+        for column, places in zip(judged, jumps, strict=True):
             if places.size:
                 found.update(places.tolist())
                 samples = "1 sample" if places.size == 1 else f"{places.size} samples"
@@ -59,6 +62,9 @@ class TablePart:
                     f"sample {row}), and no checksum covers them"
                 )
         self.doubts = sorted(found)
+
+    def _jumps(self, column: RawChannel) -> NDArray[np.int64]:
+        return lone_jumps_in_parts(_finite(column.values[self.first : self.end])) + self.first
 
     def count(self, damage: Damage) -> Damage:
         """Return the account of the file with the samples in doubt."""
@@ -125,5 +131,6 @@ def without(channels: Mapping[int, RawChannel], left_out: Mask) -> dict[int, Raw
 
 def _finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Without infinite values: no damage writes one into a text, so the drive did, and it counts as invalid later."""
-    endless = np.isinf(values)
-    return np.where(endless, np.nan, values) if endless.any() else values
+    if not np.isinf([np.fmin.reduce(values, initial=0.0), np.fmax.reduce(values, initial=0.0)]).any():
+        return values  # no mask as long as the record
+    return np.where(np.isinf(values), np.nan, values)

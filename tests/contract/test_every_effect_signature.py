@@ -17,7 +17,9 @@ from flexid_cli.simulate.machine import Axis, Trajectory
 
 RATE, BAND, SAMPLES, GEAR = 1000.0, 40.0, 8000, 50.0
 AXIS = Axis(Jm=2.0, K=3000.0, JL=1.5, FVm=3.0, FSm=0.5, FV=1.0, FS=0.2, MX=0.0, MY=0.0, reversal_velocity=0.1)
-BASE = Base(Jm=2.0, K=3000.0, JL=1.5, FVm=3.0, FSm=0.5, FV=1.0, FS=0.2, motor_reversal=0.1, load_reversal=0.1)
+BASE = Base(
+    Jm=2.0, K=3000.0, JL=1.5, FVm=3.0, FSm=0.5, FV=1.0, FS=0.2, motor_reversal=0.1, load_reversal=0.1, gear_ratio=GEAR
+)  # fmt: skip
 NOISE = NoiseLevels(0.02, 1e-6, 1e-6)
 FORMS = [Form(e, k) for e in effects() for k in range(len(e.signatures))]
 EVERY = pytest.mark.parametrize("form", FORMS, ids=lambda f: f"{f.name}-{f.index}")
@@ -144,7 +146,8 @@ def test_columns_and_values_are_well_formed(form: Form, plain: dict[bool, Proble
             assert x.shape[0] == SAMPLES
             assert np.all(np.isfinite(x))
             assert np.any(x != 0.0)
-        rows = problem.effect_rows(lambda m, s=shape: form.signature.columns(m, s))
+        rows, slopes = problem.effect_rows(lambda m, s=shape: form.signature.columns(m, s))
+        assert slopes.shape == (rows.shape[1],)
         assert rows.shape == (problem.target().size, *widths)
         assert np.all(np.isfinite(rows))
         fixed = form.signature.fixed
@@ -184,7 +187,8 @@ def test_columns_agree_with_the_law_of_the_simulation(name: str, index: int):
     shift = 0.5 if name == "torque_saturation" else 0.0  # the torque that drives is held
     for both in sides_of_law(form):
         problem = problem_of(run, both, shift)
-        told = problem.effect_rows(lambda m: form.signature.columns(m, shape)) @ amplitudes
+        whole, _ = problem.effect_rows(lambda m: form.signature.columns(m, shape), np.zeros(amplitudes.size))
+        told = whole @ amplitudes
         seen = misfit(problem)
         size = float(np.linalg.norm(told))
         assert np.linalg.norm(misfit(problem_of(none, both, shift))) < 0.02 * size

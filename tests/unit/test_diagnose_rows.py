@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flexid_cli.diagnose.basis import solve
 from flexid_cli.diagnose.problem import Problem, Stretch
 from flexid_cli.diagnose.rows import Taper, Weights
 from flexid_cli.effects.motion import Base, Terms
@@ -77,7 +78,7 @@ def test_back_is_the_transpose_of_apply_over_the_taper(equations):
 def test_back_through_the_model_is_the_transpose_of_an_effects_rows(both, equation):
     p = noise_only(NoiseLevels(0.05, 1e-5, 2e-5), both)
     column = smooth(5)
-    rows = p.effect_rows(lambda _: Terms(**{equation: column[:, None]}))[:, 0]
+    rows = p.effect_rows(lambda _: Terms(**{equation: column[:, None]}), np.zeros(1))[0][:, 0]
     other = np.random.default_rng(11).standard_normal(rows.size)
     (back,) = p.back(other, equation)
     assert back @ column == pytest.approx(rows @ other, abs=1e-5 * np.linalg.norm(rows) * rows.size**0.5)
@@ -117,6 +118,51 @@ def test_a_linear_relation_holds_in_the_rows():
     assert np.abs(misfit(p)).max() < 1e-5 * np.abs(p.target()).max()
     alone = problem(Segment(0.0, torque, motor, None), NoiseLevels(0.01, 1e-7, 0.0))
     assert np.abs(alone.target()).max() < 1e-5 * alone.signal()
+
+
+def wave(sizes: dict[float, float], order: int) -> np.ndarray:
+    """Derivative of a sum of sines of the given frequencies and amplitudes."""
+    return np.asarray(
+        sum((a * (2j * np.pi * f) ** order * np.exp(2j * np.pi * f * TIME)).imag for f, a in sizes.items())
+    )
+
+
+def test_a_load_torque_from_elsewhere_does_not_draw_the_stiffness_to_zero():
+    """K = JL = 0 fulfils the load equation whatever it lacks; K rests on the motor equation alone."""
+    joint, strange = {0.7: 3e-2, 3.0: 5e-3}, {0.41: 0.4, 1.9: 0.5}
+
+    def spring(order: int) -> np.ndarray:
+        own = BASE.JL * wave(joint, order + 2) + BASE.FV * wave(joint, order + 1)
+        return own + BASE.JL * wave(strange, order)
+
+    motor = wave(joint, 0) + spring(0) / BASE.K
+    rate, acceleration = (wave(joint, k) + spring(k) / BASE.K for k in (1, 2))
+    torque = BASE.Jm * acceleration + BASE.FVm * rate + spring(0)
+    p = problem(Segment(0.0, torque, motor, wave(joint, 0)), NoiseLevels(0.01, 1e-7, 1e-7))
+    names = ("Jm", "FVm", "K", "c", "JL", "FV")
+    found = solve(p.base_rows()[:, [p.names.index(n) for n in names]], p.target())
+    values = dict(zip(names, found.coefficients, strict=True))
+    assert found.rms > 100.0
+    assert values["K"] == pytest.approx(BASE.K, rel=5e-3)
+    assert values["Jm"] == pytest.approx(BASE.Jm, rel=5e-3)
+
+
+def test_the_spring_in_an_effect_of_the_transmission_is_left_to_the_stiffness():
+    joint = wave({0.7: 3e-2, 3.0: 5e-3}, 0)
+    motor = joint + wave({0.9: 1e-3, 4.0: 2e-4}, 0)
+    p = problem(Segment(0.0, np.zeros(SAMPLES), motor, joint), NoiseLevels(0.01, 1e-7, 1e-7))
+    cube = lambda m: Terms(transmission=m.deflection[:, None] ** 3)  # noqa: E731
+    spring, _ = p.effect_rows(lambda m: Terms(transmission=m.deflection[:, None]), np.zeros(1))
+    whole, _ = p.effect_rows(cube, np.zeros(1))
+    rows, slopes = p.effect_rows(cube)
+    np.testing.assert_allclose(rows + spring * slopes, whole, atol=1e-9 * np.abs(whole).max())
+    assert slopes[0] == pytest.approx(3.0 * np.mean((motor - joint) ** 2), rel=0.1)
+    place, none = p.effect_rows(lambda m: Terms(transmission=np.cos(m.joint_position)[:, None]))
+    assert none[0] == 0.0
+    assert place.any()
+    nothing, stiffness = p.effect_rows(lambda m: Terms(transmission=7.0 * m.deflection[:, None]))
+    assert stiffness[0] == pytest.approx(7.0)
+    assert not nothing.any()
 
 
 def test_a_held_torque_is_the_same_as_one_that_acts_half_a_period_later():

@@ -61,9 +61,9 @@ def _once_a_turn(scale: Scale) -> Sequence[Shape] | None:
     return () if scale.gear_ratio > 1.0 and turns > 2.0 else None
 
 
-def _motor_values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+def _motor_values(a: Array, _: Sequence[float], base: Base) -> dict[str, float]:
     size, phase = amplitude_and_phase(a)
-    return {"motor_amplitude": size, "motor_phase": phase}
+    return {"motor_amplitude": size, "motor_phase": phase, "motor_cycles": base.gear_ratio}
 
 
 EFFECT = Effect(
