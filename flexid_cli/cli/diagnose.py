@@ -65,8 +65,8 @@ INCONCLUSIVE = 3
     "--simulation",
     metavar="LOG",
     type=click.Path(path_type=Path),
-    help="Log of your own simulator with the same channels, to be compared with LOG. Not supported yet: it is"
-    " refused; give the simulator's parameters by --report instead.",
+    help="Log of your own simulator with the same channels, whose parameters the model takes as known; told is too"
+    " what the simulator itself holds beside the model.",
 )
 @click.option(
     "--fail-on",
@@ -105,18 +105,17 @@ def diagnose(
     to .json and .md files (figures as SVG beside the Markdown); -o - prints the JSON instead, and -qq prints no
     report. Exit code 3: the data are too poor to judge.
     """
-    from flexid_cli.cli.known import known_input, known_parameters
+    from flexid_cli.cli.known import known_input, known_parameters, simulated_parameters
     from flexid_cli.config.load import load_config
     from flexid_cli.report.write import check_formats
 
-    if simulation is not None:
+    if simulation is not None and known is not None:
         raise UsageError(
-            f"--simulation {simulation}: comparing two logs is not supported yet",
-            "give the simulator's parameters by --report FILE instead",
+            "--simulation and --report both give the model's parameters", "leave out one of the two"
         )
     files = [path for path in outputs if path != STDOUT]
     check_formats(files)
-    sources = [*logs, *validation, config, *([] if known is None else [known])]
+    sources = [*logs, *validation, config, *(p for p in (known, simulation) if p is not None)]
     check_outputs(outputs, force=force, inputs=sources)
     loaded = load_config(config, overrides)
     recording, inputs = _read(logs, loaded, console, "recording", (start, end), strict, keep_suspect)
@@ -128,6 +127,12 @@ def diagnose(
     if known is not None:
         parameters = known_parameters(known, recording, console)
         inputs.append(known_input(known))
+    if simulation is not None:
+        simulated, more = _read(
+            (simulation,), loaded, console, "parameters", (None, None), strict, keep_suspect
+        )
+        inputs += more
+        parameters = simulated_parameters(simulation, simulated, loaded, console)
     diagnosis, document = _diagnose(recording, other, loaded, inputs, parameters)
     write_reports(files, document, diagnosis, console, force=force)
     if as_json or STDOUT in outputs:

@@ -1,4 +1,4 @@
-"""Parameters out of an earlier report, for ``flexid diagnose --report``."""
+"""Parameters out of an earlier report or of a simulator's log, for ``flexid diagnose``."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from flexid_cli.errors import InputError
 
 if TYPE_CHECKING:
     from flexid_cli.cli.options import Console
+    from flexid_cli.config.schema import Config
     from flexid_cli.report.document import InputFile
     from flexid_cli.signals.recording import Recording
 
@@ -36,6 +37,27 @@ def known_parameters(path: Path, recording: Recording, console: Console) -> dict
     for note in given.notes:
         console.warning(note)
     return dict(given.values)
+
+
+def simulated_parameters(
+    path: Path, simulated: Recording, config: Config, console: Console
+) -> dict[str, float]:
+    """Estimates by symbol (SI, joint side) of the log of a simulator, which may hold more than the model does.
+
+    Raises
+    ------
+    DataError
+        The log is too short, or shows no flexible axis at all.
+    """
+    from flexid_cli.diagnose.diagnose import diagnose
+
+    found = diagnose(simulated, config)
+    if found.verdict != "adequate":
+        console.warning(
+            f"{path}: the simulation is not the plain model itself. {found.sentence} What recording and simulation"
+            " share is not what your simulator leaves out."
+        )
+    return {e.symbol: e.value for e in found.parameters_after if e.value is not None}
 
 
 def _kind(torque_unit: object, linear: object) -> str:

@@ -26,7 +26,7 @@ from flexid_cli.diagnose.result import (
 from flexid_cli.diagnose.search import Candidate, Form
 from flexid_cli.diagnose.selection import Selection, select, threshold
 from flexid_cli.diagnose.simulation import simulation_error
-from flexid_cli.diagnose.start import first_problem
+from flexid_cli.diagnose.start import first_problem, has_joint
 from flexid_cli.effects.base import EffectValues
 from flexid_cli.effects.registry import effects as library
 from flexid_cli.estimate.result import Estimate
@@ -69,19 +69,20 @@ def diagnose(
     DataError
         The recording is too short, or shows no flexible axis at all.
     """
-    both = recording.has_joint_position
-    fitter = Fitter(_forms(both), _shifts(config))
+    both = has_joint(recording, config)
+    fitter = Fitter(_forms(both, linear=recording.linear), _shifts(config))
     problem = first_problem(recording, config, fitter)
     selection = select(fitter, problem)
     return _Report(fitter, selection, recording, config, validation, known or {}).diagnosis()
 
 
-def _forms(both: bool) -> list[Form]:
+def _forms(both: bool, *, linear: bool = False) -> list[Form]:
     return [
         Form(effect, k)
         for effect in library()
         for k, signature in enumerate(effect.signatures)
         if not (signature.motor_alone if both else signature.needs_joint)
+        and not (signature.rotary and linear)
     ]
 
 
@@ -109,16 +110,17 @@ class _Report:
         self.fitter, self.selection, self.recording, self.config = fitter, selection, recording, config
         self.known = known
         after = selection.after
-        remaining = residual_maps(after.problem, after.basis)
-        unexplained = verdict.is_unexplained(after.basis.rms, remaining, both=after.problem.both)
-        self.verdict = verdict.decide(selection, unexplained)
+        self.remaining = residual_maps(after.problem, after.basis)
+        left = verdict.remainder(after.basis.rms, self.remaining, both=after.problem.both)
+        self.verdict = verdict.decide(selection, left)
         # What does not explain the record is not named: the baseline stands, and the place of its mismatch.
         named = self.verdict not in ("unexplained", "inconclusive")
         self.final: Fitted = after if named else selection.before
         self.maps = residual_maps(selection.before.problem, selection.before.basis)
         self.other = None
         if validation is not None:
-            self.other = first_problem(validation, config, fitter)
+            # A model is checked in the band that it was fitted in.
+            self.other = first_problem(validation, config, fitter, selection.before.problem.band_hz)
 
     def diagnosis(self) -> Diagnosis:
         """Assemble the result."""
@@ -136,9 +138,9 @@ class _Report:
         return Diagnosis(
             verdict=self.verdict,
             sentence=verdict.sentence(self.verdict, named, equation, variable, share),
-            model="two_encoders" if before.problem.both else "motor_only",
+            model=before.problem.model,
             effects=named,
-            location=place if self.verdict == "unexplained" else None,
+            location=place if self.verdict in ("unexplained", "partly_explained") else None,
             held_out=self._held_out(*unseen),
             simulation=self._simulation(parameters_before, parameters_after),
             parameters_before=parameters_before,
@@ -236,7 +238,8 @@ class _Report:
         )
 
     def _place(self) -> Where | None:
-        return located(self.maps[0], self.recording) if self.maps else None
+        maps = self.remaining if self.verdict == "partly_explained" else self.maps
+        return located(maps[0], self.recording) if maps else None
 
     def _tested(self) -> tuple[Tested, ...]:
         met = {c.form.name: c for c in self.selection.tested}

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.fitter import Fitted
-from flexid_cli.diagnose.problem import MODEL_FLOOR, SCALED, Problem, Stretch
+from flexid_cli.diagnose.problem import MODEL_FLOOR, RIGID_NAMES, SCALED, Problem, Stretch
 from flexid_cli.effects.base import unit_of
 from flexid_cli.estimate.covariance import RobustCovariance, robust_covariance
 from flexid_cli.estimate.result import Estimate
 from flexid_cli.estimate.verdict import judge
 from flexid_cli.models.base import Parameter
+from flexid_cli.models.rigid import Rigid
 from flexid_cli.signals.recording import Segment
 
 Array = NDArray[np.float64]
@@ -29,7 +30,9 @@ BASE_PARAMETERS = (
     Parameter("load_coulomb_friction", "FS", "torque", positive=True),
     Parameter("gravity_moment_x", "MX", "first_moment"),
     Parameter("gravity_moment_y", "MY", "first_moment"),
+    Parameter("torque_offset", "offset", "torque"),
 )
+RIGID = dict(zip(RIGID_NAMES, Rigid("none").parameters, strict=True))
 NOISE_SEEDS = (20010521, 20010522)
 DOUBT_OF_CORRECTION = 0.5  # share of the noise's bias that its correction may be wrong by
 # A torque that no model predicts better than MODEL_FLOOR gives no parameter better than this share of it.
@@ -53,26 +56,34 @@ def solved(fitted: Fitted) -> Solved:
     that passes the same chain, and is taken off.
     """
     problem, X, plain = fitted.problem, fitted.basis.columns, fitted.basis.coefficients
+    shapes = [_shape_tangents(fitted, k) for k in range(len(fitted.chosen))]
+    tangents = np.hstack([t for t, _ in shapes]) if shapes else np.empty((X.shape[0], 0))
+    stiffened = np.concatenate([s for _, s in shapes]) if shapes else np.empty(0)
+    X = np.hstack([X, tangents])  # what the shapes' uncertainty does to the coefficients
     bread = _bread(X)
     shift = _noise_shift(fitted) if problem.both else np.zeros_like(plain)
     robust = _robust(fitted, X, bread)
     doubt = DOUBT_OF_CORRECTION * shift
     whole = plain + shift
     size = np.abs(whole)
-    if not problem.both:
-        size[: len(problem.names)] += [abs(getattr(problem.base, name)) for name in problem.names]
+    size[: len(problem.names)] += [abs(problem.linearised(name)) for name in problem.names]
     floor = np.diag((FLOOR_SHARE * MODEL_FLOOR * size) ** 2)
-    covariance = robust.covariance + np.outer(doubt, doubt) + floor
+    covariance, p = robust.covariance, plain.size
+    covariance[:p, :p] += np.outer(doubt, doubt) + floor
     if problem.both:
-        whole, covariance = unscaled(fitted, whole, covariance)
-    return Solved(whole, covariance, robust.degrees_of_freedom)
+        whole, covariance = unscaled(fitted, whole, covariance, stiffened)
+    return Solved(whole, covariance[:p, :p], robust.degrees_of_freedom[:p])
 
 
-def unscaled(fitted: Fitted, coefficients: Array, covariance: Array) -> tuple[Array, Array]:
-    """The load's parameters without the factor K0 / K of `Problem`, and K without the effects' stiffness."""
+def unscaled(fitted: Fitted, coefficients: Array, covariance: Array, stiffened: Array) -> tuple[Array, Array]:
+    """The load's parameters without the factor K0 / K of `Problem`, and K without the effects' stiffness.
+
+    ``covariance`` holds the shapes behind the coefficients; by them the effects' stiffness changes by ``stiffened``.
+    """
     problem = fitted.problem
     k, whole = problem.names.index("K"), problem.stiffness
-    G, out = np.eye(coefficients.size), coefficients.copy()
+    G, out = np.eye(covariance.shape[0]), coefficients.copy()
+    G[k, coefficients.size :] = -stiffened
     for name in SCALED:
         i = problem.names.index(name)
         G[i, i], G[i, k] = coefficients[k] / whole, coefficients[i] / whole
@@ -143,14 +154,12 @@ def base_estimates(
             continue
         k = problem.names.index(parameter.symbol)
         value = float(result.coefficients[k])
-        if not problem.both:
-            value += float(getattr(problem.base, parameter.symbol))
+        value += problem.linearised(parameter.symbol)
         stderr = float(np.sqrt(max(result.covariance[k, k], 0.0)))
         unit = unit_of(parameter.quantity, linear=linear, torque_unit=torque_unit)
-        is_split = parameter.quantity in {"viscous", "torque"} and not problem.both
         out.append(
             judge(
-                replace(parameter, split=is_split),
+                _reported(parameter, problem),
                 unit,
                 value,
                 stderr,
@@ -160,6 +169,13 @@ def base_estimates(
             )
         )
     return tuple(out)
+
+
+def _reported(parameter: Parameter, problem: Problem) -> Parameter:
+    """The parameter as the baseline knows it: one encoder shows hardly more than the sums of motor and load."""
+    if problem.rigid:
+        return RIGID.get(parameter.symbol, parameter)
+    return replace(parameter, split=parameter.quantity in {"viscous", "torque"} and not problem.both)
 
 
 def effect_estimates(
@@ -197,15 +213,24 @@ def _value_spread(fitted: Fitted, k: int) -> dict[str, float]:
 
 def _tangents(fitted: Fitted, k: int) -> Array:
     """Derivatives of an effect's rows by its free amplitudes and its shapes, shape (r, p)."""
-    chosen, amplitudes = fitted.chosen[k], fitted.amplitudes(k)
-    rows = fitted.search.rows(chosen.form, chosen.shape)
-    tangents = [rows] if chosen.form.signature.fixed is None else []
+    chosen = fitted.chosen[k]
+    shapes, _ = _shape_tangents(fitted, k)
+    if chosen.form.signature.fixed is not None:
+        return shapes
+    return np.hstack([fitted.search.rows(chosen.form, chosen.shape), shapes])
+
+
+def _shape_tangents(fitted: Fitted, k: int) -> tuple[Array, Array]:
+    """Derivatives of an effect's rows and of its stiffness by its shapes, shapes (r, j) and (j,)."""
+    chosen, amplitudes, search = fitted.chosen[k], fitted.amplitudes(k), fitted.search
+    rows, slopes = search.rows(chosen.form, chosen.shape), fitted.slopes(k)
+    tangents, stiffened = [np.empty((rows.shape[0], 0))], []
     for j, value in enumerate(chosen.shape):
         step = SHAPE_STEP * (abs(value) or 1.0)
         moved = (*chosen.shape[:j], value + step, *chosen.shape[j + 1 :])
-        change = (fitted.search.rows(chosen.form, moved) - rows) @ amplitudes / step
-        tangents.append(change[:, None])
-    return np.hstack(tangents)
+        tangents.append(((search.rows(chosen.form, moved) - rows) @ amplitudes / step)[:, None])
+        stiffened.append(float((search.slopes(chosen.form, moved) - slopes) @ amplitudes / step))
+    return np.hstack(tangents), np.array(stiffened)
 
 
 def _jacobian(fitted: Fitted, k: int, errors: Array) -> dict[str, Array]:

@@ -101,4 +101,4 @@ def gains(fitter: Fitter, fitted: Fitted) -> list[float]:
         fitter.fit(fitted.problem, without(fitted.chosen, k), fitted.search)
         for k in range(len(fitted.chosen))
     ]
-    return [float(np.log(f.cost / fitted.cost)) for f in rest]
+    return [fitted.gain(f) for f in rest]

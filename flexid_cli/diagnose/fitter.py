@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import Basis, solve
 from flexid_cli.diagnose.problem import Problem
-from flexid_cli.diagnose.search import Candidate, Form, Search, golden
+from flexid_cli.diagnose.search import Candidate, Form, Search, gained, golden
 from flexid_cli.effects.motion import Base
 
 Array = NDArray[np.float64]
@@ -59,6 +59,11 @@ class Fitted:
         Twice the negative logarithm of the likelihood, for noise of the known shape and a free size, a row.
         """
         return float(np.log(max(self.basis.cost, 1e-300))) + self.problem.level
+
+    def gain(self, before: Fitted) -> float:
+        """What it explains that another fit does not, see `gained`; their rows may be weighted differently."""
+        other = self.cost * float(np.exp(before.loss - self.loss))
+        return gained(other, self.cost, self.y.size)
 
     def amplitudes(self, k: int) -> Array:
         """Amplitudes of the k-th chosen effect."""
@@ -155,6 +160,8 @@ class Fitter:
         """Reversal widths by golden section; only the Coulomb column changes with them."""
         problem = fitted.problem
         for field, symbol in (("motor_reversal", "FSm"), ("load_reversal", "FS")):
+            if symbol not in problem.names:
+                continue
             k = problem.names.index(symbol)
             # The motor alone is solved for steps: the misfit lacks the friction at the linearisation.
             y = (

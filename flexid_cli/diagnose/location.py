@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flexid_cli.diagnose.basis import Basis
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.result import Shape, Where
+from flexid_cli.diagnose.search import gained
 from flexid_cli.effects.motion import Motion, Terms
 from flexid_cli.signals.recording import Recording
 
@@ -185,7 +186,7 @@ def _explained(C: Array, now: Basis) -> tuple[float, Array, Array]:
     z = U[:, keep].T @ now.residual
     values = (Vt[keep].T @ (z / s[keep])) / size
     errors = now.rms * np.linalg.norm(Vt[keep].T / s[keep], axis=1) / size
-    return float(np.log(now.cost / max(now.cost - float(z @ z), 1e-300))), values, errors
+    return gained(now.cost, now.cost - float(z @ z), now.residual.size), values, errors
 
 
 def _lines(problem: Problem, now: Basis) -> Iterator[Map]:

@@ -20,6 +20,7 @@ from flexid_cli.pipeline.derivatives import differentiate
 from flexid_cli.signals.recording import Segment
 
 if TYPE_CHECKING:
+    from flexid_cli.config.schema import ModelName
     from flexid_cli.diagnose.search import Form
 
 Array = NDArray[np.float64]
@@ -42,6 +43,7 @@ SPRING_ALONE = 1e-3  # share of an effect of the transmission outside of a sprin
 PROBE_SEED, LEAST_PROBE = 20010523, 1e-4  # of the torsion's standard deviation
 SCALED = ("JL", "FV", "FS", "MX", "MY")  # both encoders: times K at the linearisation over K
 ALONE_NAMES = ("Jm", "FVm", "FSm", "K", "JL", "FV", "FS")
+RIGID_NAMES = ("Jm", "FVm", "FSm", "offset")  # of motor and load together
 
 
 class Stretch:
@@ -134,6 +136,8 @@ class Problem:
         Whether the linearisation began at an estimate that can be trusted.
     shift : float
         Periods by which the torque acts later than its stamp says: half a one where it is held unsaid.
+    rigid : bool
+        The motor's encoder alone, and an axis that is taken for rigid: what ``base`` says of the load stays.
     stiffening : float
         Stiffness of the effects that the linearisation holds, beside that of ``base``.
     """
@@ -154,6 +158,7 @@ class Problem:
         anchor: Base | None = None,
         settled: bool = True,
         stiffening: float = 0.0,
+        rigid: bool = False,
     ) -> None:
         self.stretches, self.noise, self.band_hz = stretches, noise, band_hz
         self.base = replace(base, gear_ratio=gear_ratio)
@@ -162,7 +167,8 @@ class Problem:
         self.settled, self.stiffening = settled, stiffening
         self.applied: Mapping[Form, Array] = applied or {}
         self.recorded = stretches
-        self.names = BOTH_NAMES if both else ALONE_NAMES
+        self.rigid = rigid
+        self.names = BOTH_NAMES if both else RIGID_NAMES if rigid else ALONE_NAMES
         self.torque_rms = float(np.sqrt(np.mean(np.concatenate([s.torque for s in stretches]) ** 2)))
         self.weights = [Weights(s.taper, self.spectral(s)) for s in stretches]
         # Eq. (18) is 1 + X2 s + X1 s^2 times the torque: the likelihood is that of the torque.
@@ -195,9 +201,21 @@ class Problem:
             anchor=self.anchor,
             settled=self.settled,
             stiffening=self.stiffening if stiffening is None else stiffening,
+            rigid=self.rigid,
         )
         other.recorded = self.recorded
         return other
+
+    @property
+    def model(self) -> ModelName:
+        """Name of the baseline, as configurations have it."""
+        return "two_encoders" if self.both else "rigid" if self.rigid else "motor_only"
+
+    def linearised(self, symbol: str) -> float:
+        """Value of a parameter that the columns are steps from; zero where they are whole ones."""
+        if self.both or symbol == "offset":
+            return 0.0
+        return float(getattr(self.base, symbol)) + (self.base.JL if self.rigid and symbol == "Jm" else 0.0)
 
     @property
     def row_times(self) -> Array:
@@ -347,10 +365,10 @@ class Problem:
         acceleration, velocity = s.derivative(s.motor, 2), s.derivative(s.motor, 1)
         passed = s.torque - b.Jm * acceleration - b.FVm * velocity - b.FSm * m.motor_sign
         first, second = s.derivative(passed, 1), s.derivative(passed, 2)
-        columns = [
-            self.through(s, acceleration),
-            self.through(s, velocity),
-            self.through(s, m.motor_sign),
+        columns = [self.through(s, x) for x in (acceleration, velocity, m.motor_sign)]
+        if self.rigid:
+            return [s.spectrum(np.column_stack([*columns, np.ones(s.torque.size)]))]
+        columns += [
             (b.JL * second + b.FV * first) / b.K**2,
             acceleration - second / b.K,
             velocity - first / b.K,
@@ -553,12 +571,15 @@ class Problem:
                 b, **new, **strong, torsion_zero=b.torsion_zero - v["c"] / (strong["K"] + stiffening)
             )
         strong = {
-            n: getattr(b, n) * float(np.clip(1.0 + v[n] / getattr(b, n), 0.7, 1.4)) for n in ("Jm", "K", "JL")
+            n: getattr(b, n) * float(np.clip(1.0 + v[n] / getattr(b, n), 0.7, 1.4))
+            for n in ("Jm", "K", "JL")
+            if n in v
         }
         if self.anchor is not None:
             held = {n: float(getattr(self.anchor, n)) for n in strong}
             strong = {n: float(np.clip(x, held[n] / ASTRAY, held[n] * ASTRAY)) for n, x in strong.items()}
-        return replace(b, **{n: getattr(b, n) + v[n] for n in ("FVm", "FSm", "FV", "FS")}, **strong)
+        friction = {n: getattr(b, n) + v[n] for n in ("FVm", "FSm", "FV", "FS") if n in v}
+        return replace(b, **friction, **strong)
 
 
 def _reversal_step(velocities: Sequence[Array], rate_hz: float, cutoff_hz: float) -> float:

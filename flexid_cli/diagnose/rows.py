@@ -128,7 +128,12 @@ def two_encoder_noise(base: Base, noise: NoiseLevels, omega: Array) -> Complex:
     A = np.stack(
         [
             np.stack(
-                [zero + noise.torque, motor * noise.motor_position, zero - base.K * noise.joint_position], -1
+                [
+                    zero + noise.torque_at(omega),
+                    motor * noise.motor_position,
+                    zero - base.K * noise.joint_position,
+                ],
+                -1,
             ),
             # Noise of the torsion pulls on motor and load in opposite directions.
             np.stack([zero, zero - base.K * noise.motor_position, load * noise.joint_position], -1),
@@ -143,5 +148,5 @@ def motor_only_noise(base: Base, noise: NoiseLevels, omega: Array) -> Complex:
     s = 1j * omega
     inverse = 1.0 + (base.FV * s + base.JL * s**2) / base.K
     motor = (base.Jm * s**2 + base.FVm * s) * inverse + base.JL * s**2 + base.FV * s
-    density = np.abs(inverse * noise.torque) ** 2 + np.abs(motor * noise.motor_position) ** 2
+    density = np.abs(inverse * noise.torque_at(omega)) ** 2 + np.abs(motor * noise.motor_position) ** 2
     return np.asarray(density[:, None, None].astype(np.complex128))

@@ -53,6 +53,8 @@ class Candidate:
     amplitudes : ndarray, shape (k,)
     before, cost : float
         Sum of squares of the residual without it and with it.
+    rows : int
+        Number of rows: the sum of squares of their noise.
     refused : str
         Why it cannot be the effect although it may fit.
     """
@@ -62,12 +64,13 @@ class Candidate:
     amplitudes: Array
     before: float
     cost: float
+    rows: int
     refused: str = ""
 
     @property
     def gain(self) -> float:
-        """Logarithm of the cost before over after."""
-        return float(np.log(self.before / max(self.cost, 1e-300)))
+        """See `gained`."""
+        return gained(self.before, self.cost, self.rows)
 
     @property
     def rank(self) -> tuple[bool, float]:
@@ -125,29 +128,32 @@ class Search:
     def evaluate(self, form: Form, shape: tuple[float, ...], now: Basis) -> Candidate:
         """Fit a form's amplitudes, or take the fixed one, at one shape."""
         C = self.rows(form, shape)
-        before, signature = now.cost, form.signature
+        before, signature, count = now.cost, form.signature, now.residual.size
         if signature.fixed is not None:
             e = now.residual - now.outside(C[:, 0] * signature.fixed)
-            return Candidate(form, shape, np.array([signature.fixed]), before, float(e @ e))
+            return Candidate(form, shape, np.array([signature.fixed]), before, float(e @ e), count)
         P = now.outside(C)
         norm = np.linalg.norm(P, axis=0)
         if not np.all(norm > DEPENDENT * np.maximum(np.linalg.norm(C, axis=0), 1e-300)):
-            return Candidate(
-                form, shape, np.zeros(C.shape[1]), before, before, "its columns depend on the model's"
-            )
+            nothing, why = np.zeros(C.shape[1]), "its columns depend on the model's"
+            return Candidate(form, shape, nothing, before, before, count, why)
         q, r = np.linalg.qr(P / norm)
         z = q.T @ now.residual
         amplitudes = np.linalg.lstsq(r, z, rcond=None)[0] / norm
-        cost = max(before - float(z @ z), 0.0)
-        if signature.sign * amplitudes[0] < 0.0:
-            return Candidate(
-                form, shape, amplitudes, before, before, "physics forbids the sign that the fit gives it"
-            )
+        refused = self._refused(form, shape, amplitudes)
+        cost = before if refused else max(before - float(z @ z), 0.0)
+        if not refused and signature.tied is not None:
+            refused = signature.tied(amplitudes, shape, self.problem.base)
+        return Candidate(form, shape, amplitudes, before, cost, count, refused)
+
+    def _refused(self, form: Form, shape: tuple[float, ...], amplitudes: Array) -> str:
+        """Why amplitudes are out of the question, or nothing."""
+        if form.signature.sign * amplitudes[0] < 0.0:
+            return "physics forbids the sign that the fit gives it"
         stiffening = float(amplitudes @ self.slopes(form, shape))
         if not LEAST_SPRING < 1.0 - stiffening / self.problem.stiffness < MOST_SPRING:
-            return Candidate(form, shape, amplitudes, before, before, "it would take the spring's place")
-        refused = "" if signature.tied is None else signature.tied(amplitudes, shape, self.problem.base)
-        return Candidate(form, shape, amplitudes, before, cost, refused)
+            return "it would take the spring's place"
+        return ""
 
     def best(self, form: Form, now: Basis) -> Candidate | None:
         """Search a form's shape; None where the record cannot show it."""
@@ -208,6 +214,15 @@ class Search:
 
         golden(cost, low, high, sections)
         return min(found, key=lambda c: c.rank)
+
+
+def gained(before: float, after: float, rows: int) -> float:
+    """Logarithm of the sums of squares before over after, each with that of the noise.
+
+    Whitened noise has one a row. What stays below the noise that the signals themselves show is no finding, however
+    large its share of the residual.
+    """
+    return float(np.log((before + rows) / (after + rows)))
 
 
 def golden(cost: Callable[[float], float], low: float, high: float, steps: int) -> float:

@@ -15,8 +15,8 @@ RIVALS = 3
 NEAR_RIVAL = 0.5  # of the best candidate's gain
 # Least gain (logarithm of the cost) of an effect, and what an alternative may be worse by. Calibrated, see
 # docs/diagnosis.md.
-ENOUGH = 0.15
-ENOUGH_ALONE = 0.4  # without a joint encoder
+ENOUGH = 0.12
+ENOUGH_ALONE = 0.4  # flexible, without a joint encoder
 AS_GOOD = 0.05
 LOOKED_AT = 0.6  # gain that a rival may be behind before its own refit
 
@@ -52,7 +52,7 @@ def select(fitter: Fitter, problem: Problem) -> Selection:
     found = tested
     while len(fitted.chosen) < MOST_EFFECTS:
         new = _added(fitter, fitted, found)
-        if new is None or fitted.loss - new.loss < enough:
+        if new is None or new.gain(fitted) < enough:
             break
         fitted = _needed(fitter, new, enough)
         found = fitter.candidates(fitted)
@@ -62,7 +62,7 @@ def select(fitter: Fitter, problem: Problem) -> Selection:
 
 def threshold(problem: Problem) -> float:
     """Least gain that names an effect in this record."""
-    return ENOUGH if problem.both else ENOUGH_ALONE
+    return ENOUGH if problem.both or problem.rigid else ENOUGH_ALONE
 
 
 def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted | None:
@@ -80,16 +80,16 @@ def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted | N
 
 
 def _needed(fitter: Fitter, fitted: Fitted, enough: float) -> Fitted:
-    """Leave out effects that the others have made needless."""
+    """Leave out effects that the others, with shapes of their own, make needless."""
     while len(fitted.chosen) > 1:
         smaller = [
-            fitter.fit(fitted.problem, without(fitted.chosen, k), fitted.search)
+            fitter.relax(fitted.problem, without(fitted.chosen, k), rounds=2)
             for k in range(len(fitted.chosen))
         ]
-        weakest = min(smaller, key=lambda f: f.cost)
-        if np.log(weakest.cost / fitted.cost) > enough:
+        weakest = min(smaller, key=lambda f: f.loss)
+        if fitted.gain(weakest) > enough:
             break
-        fitted = fitter.relax(fitted.problem, weakest.chosen, rounds=1)
+        fitted = weakest
     return fitted
 
 

@@ -26,6 +26,10 @@ def simulation_error(
     position_unit: str,
 ) -> SimulationError:
     """Difference of simulation and recording, by the parameters of both models (symbols to values)."""
+    if problem.rigid:
+        return SimulationError(
+            None, None, "torque", unit, "a rigid axis has no motion of its own to simulate"
+        )
     stretch = max(problem.stretches, key=lambda s: s.torque.size)
     quantity = "joint_position" if problem.both else "torque"
     try:

@@ -14,7 +14,7 @@ from flexid_cli.diagnose.problem import SHORTEST_S, SMOOTH_BAND, Problem, Stretc
 from flexid_cli.diagnose.rows import motor_only_noise, two_encoder_noise
 from flexid_cli.effects.motion import Base
 from flexid_cli.errors import DataError
-from flexid_cli.estimate.band import usable_band
+from flexid_cli.estimate.band import torque_band, usable_band
 from flexid_cli.estimate.budget import NoiseLevels, noise_levels
 from flexid_cli.pipeline.columns import reversal
 from flexid_cli.signals.recording import Recording
@@ -29,20 +29,32 @@ FIRST_WIDTH = 0.004  # of the highest speed
 SCAN_POINTS, SCAN_STEPS = 14, 4
 RIGID = 100.0  # times the band: a resonance that is nowhere in it
 SCANNED_WITH = ("torque_offset", "gravity", "joint_damping", "load_dependent_friction", "viscous_nonlinear")
+# Where the torque's noise is looked for: times the band, least lines, and how far it is taken to rise below.
+ABOVE, LEAST_LINES, MOST_FALL = (1.1, 2.2), 8, 5.0
 SCAN_LOW = 8.0  # lowest locked-motor frequency looked at, cycles in the record
 
 
-def first_problem(recording: Recording, config: Config, fitter: Fitter) -> Problem:
-    """The record in its band, linearised where a simple fit puts it.
+def has_joint(recording: Recording, config: Config) -> bool:
+    """Whether the baseline has a motor and a load equation: with a joint encoder, unless a rigid axis is declared."""
+    return recording.has_joint_position and config.models != ("rigid",)
+
+
+def first_problem(
+    recording: Recording, config: Config, fitter: Fitter, highest_hz: float = np.inf
+) -> Problem:
+    """The record in its band, up to ``highest_hz`` at most, linearised where a simple fit puts it.
 
     Raises
     ------
     DataError
         The record is too short, or shows no flexible axis.
     """
-    both = recording.has_joint_position
+    both = has_joint(recording, config)
     rate = recording.sample_rate_hz
-    band = min(usable_band(recording, joint=both), HIGHEST_BAND * rate)
+    band = min(usable_band(recording, joint=both), HIGHEST_BAND * rate, highest_hz)
+    rigid = config.models == ("rigid",)
+    if rigid:
+        band = min(band, torque_band(recording))  # above it springs and noise would be all there is
     segments = [s for s in recording.segments if s.samples > SHORTEST_S * rate]
     if not segments:
         raise DataError(
@@ -53,6 +65,10 @@ def first_problem(recording: Recording, config: Config, fitter: Fitter) -> Probl
     speed = float(np.quantile(np.abs(np.concatenate([s.motor_velocity for s in stretches])), 0.98))
     width = FIRST_WIDTH * speed
     base = (_both_base if both else _rigid_base)(stretches, width)
+    if rigid:
+        base = replace(
+            base, K=_rigid_stiffness(base, band), FVm=2.0 * base.FVm, FV=0.0, FSm=base.FSm + base.FS, FS=0.0
+        )
     problem = Problem(
         stretches,
         base,
@@ -63,12 +79,13 @@ def first_problem(recording: Recording, config: Config, fitter: Fitter) -> Probl
         duration_s=recording.duration_s,
         both=both,
         shift=fitter.shifts[0],
+        rigid=rigid,
     )
-    if not both:
+    if not both and not rigid:
         known = _identified(recording, config, width)
         problem = _scanned(problem, fitter) if known is None else problem.at(known)
         problem.anchor, problem.settled = problem.base, known is not None
-    return _with_torque_noise(fitter.relax(problem, rounds=1).problem if both else problem)
+    return _with_torque_noise(fitter.relax(problem, rounds=1).problem if both or rigid else problem)
 
 
 def _both_base(stretches: list[Stretch], width: float) -> Base:
@@ -147,6 +164,11 @@ def _rigid_base(stretches: list[Stretch], width: float) -> Base:
     )  # fmt: skip
 
 
+def _rigid_stiffness(base: Base, band_hz: float) -> float:
+    """Stiffness of a spring whose torsion is nothing in the band."""
+    return base.JL * (2.0 * np.pi * RIGID * band_hz) ** 2
+
+
 def _identified(recording: Recording, config: Config, width: float) -> Base | None:
     """Parameters by `identify`, which gravity and offset do not lead astray; None where it finds no resonance."""
     from flexid_cli.estimate.identify import identify
@@ -178,7 +200,7 @@ def _scanned(problem: Problem, fitter: Fitter) -> Problem:
         if f.name in SCANNED_WITH and not f.signature.shapes(problem.scale())
     ]
     base = problem.base
-    rigid = problem.at(replace(base, K=base.JL * (2.0 * np.pi * RIGID * problem.band_hz) ** 2))
+    rigid = problem.at(replace(base, K=_rigid_stiffness(base, problem.band_hz)))
     trials = [(fitter.fit(rigid, free).loss, rigid)]
     low = SCAN_LOW / problem.duration_s
     for frequency in np.geomspace(max(low, 0.02 * problem.band_hz), 0.8 * problem.band_hz, SCAN_POINTS):
@@ -190,7 +212,7 @@ def _scanned(problem: Problem, fitter: Fitter) -> Problem:
 
 
 def _with_torque_noise(problem: Problem) -> Problem:
-    """Raise the torque's noise to what stands in the motor equation just above the band.
+    """Raise the torque's noise to what stands in the motor equation just above the band, and continue its fall.
 
     A current's noise is seldom white; that of the encoders is taken off by its known shape.
     """
@@ -200,8 +222,8 @@ def _with_torque_noise(problem: Problem) -> Problem:
     noise = problem.noise
     rest = _misfit(problem, s)[100:-100]
     f, density = welch(rest, fs=s.rate_hz, nperseg=int(min(rest.size, 1024)))
-    use = (f > 1.1 * problem.band_hz) & (f < min(2.2 * problem.band_hz, 0.3 * s.rate_hz))
-    if not use.any():
+    use = (f > ABOVE[0] * problem.band_hz) & (f < min(ABOVE[1] * problem.band_hz, 0.3 * s.rate_hz))
+    if np.count_nonzero(use) < LEAST_LINES:
         return problem
     omega = 2.0 * np.pi * f[use]
     encoders = NoiseLevels(0.0, noise.motor_position, noise.joint_position)
@@ -209,10 +231,28 @@ def _with_torque_noise(problem: Problem) -> Problem:
     known = make(problem.base, encoders, omega)[:, 0, 0].real
     b = problem.base
     passed = 1.0 if problem.both else np.abs(1.0 + (1j * b.FV * omega - b.JL * omega**2) / b.K) ** 2
-    left = float(np.median((density[use] * 0.5 * s.rate_hz - known) / passed))
-    torque = float(np.sqrt(max(left, noise.torque**2)))
-    problem.noise = NoiseLevels(torque, noise.motor_position, noise.joint_position)
+    left = (density[use] * 0.5 * s.rate_hz - known) / passed
+    level, corner = _first_order(f[use], left)
+    if level < noise.torque**2:
+        level, corner = noise.torque**2, np.inf
+    problem.noise = replace(noise, torque=float(np.sqrt(level)), torque_corner_hz=corner)
     return problem.at(problem.base)
+
+
+def _first_order(f: Array, density: Array) -> tuple[float, float]:
+    """Level at low frequency and corner of a density 1 / (1 + (f / corner)^2), by its medians low and high in f.
+
+    The level is at most `MOST_FALL` times what is seen: what lies below the range is not seen at all.
+    """
+    halves = np.array_split(np.arange(f.size), 2)
+    (f1, f2), (p1, p2) = ([float(np.median(x[h])) for h in halves] for x in (f, density))
+    whole = float(np.median(density))
+    if not 0.0 < p2 < p1:
+        return whole, np.inf
+    slope = (1.0 / p2 - 1.0 / p1) / (f2**2 - f1**2)
+    slope = min(slope, (1.0 - 1.0 / MOST_FALL) / (p1 * f1**2))
+    level = 1.0 / (1.0 / p1 - slope * f1**2)
+    return level, float(np.sqrt(1.0 / (level * slope)))
 
 
 def _misfit(problem: Problem, s: Stretch) -> Array:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 from flexid_cli.diagnose.location import Map
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.result import NamedEffect, Verdict
 from flexid_cli.diagnose.selection import Selection
+
+Remainder = Literal["function", "size", ""]
 
 # Calibrated, see docs/diagnosis.md: gain of a free function of one variable that nothing explains by chance, and
 # RMS of whitened rows that the finite filters leave of a complete model.
@@ -48,25 +51,29 @@ def is_poor(problem: Problem) -> bool:
     return problem.signal() < LEAST_SIGNAL
 
 
-def is_unexplained(rms: float, maps: Sequence[Map], *, both: bool) -> bool:
-    """Whether a model leaves what its noise does not explain."""
+def remainder(rms: float, maps: Sequence[Map], *, both: bool) -> Remainder:
+    """What a model leaves beside its noise: a function of some variable, more than noise anyhow, or nothing."""
     gain, most = (
         (UNEXPLAINED_GAIN, UNEXPLAINED_RMS) if both else (UNEXPLAINED_GAIN_ALONE, UNEXPLAINED_RMS_ALONE)
     )
-    return rms > most or (bool(maps) and maps[0].gain > gain)
+    if maps and maps[0].gain > gain:
+        return "function"
+    return "size" if rms > most else ""
 
 
-def decide(selection: Selection, unexplained: bool) -> Verdict:
-    """Verdict of a selection whose remainder is explained or not."""
-    problem = selection.before.problem
+def decide(selection: Selection, left: Remainder) -> Verdict:
+    """Verdict of a selection that leaves a function, more than noise, or nothing."""
+    problem, chosen = selection.before.problem, selection.after.chosen
     # A start that could not be trusted, and nothing that explains the record: the baseline may stand anywhere.
-    astray = not problem.settled and (unexplained or not selection.after.chosen)
+    astray = not problem.settled and bool(left or not chosen)
     if is_poor(problem) or astray:
         return "inconclusive"
-    if unexplained:
+    if left == "function" or (left and not chosen):
         return "unexplained"
-    if not selection.after.chosen:
+    if not chosen:
         return "adequate"
+    if left:
+        return "partly_explained"
     return "ambiguous" if any(selection.alternatives) else "explained"
 
 
@@ -91,7 +98,12 @@ def sentence(
         )
     names = " and ".join(e.name.replace("_", " ") for e in effects)
     text = f"The model left out {names}; with it {100.0 * share:.0f} % of the mismatch above the noise is explained."
-    if verdict == "ambiguous":
+    if verdict == "partly_explained":
+        text += (
+            " What stays is above the noise and no clear function of anything; most of it sits"
+            f" {PLACES[equation]}, as a function of {VARIABLES[variable]}."
+        )
+    if any(e.alternatives for e in effects):
         open_ones = [e for e in effects if e.alternatives]
         others = "; ".join(f"{e.name} could also be {', '.join(e.alternatives)}" for e in open_ones)
         text += f" The recording cannot decide everything: {others}.".replace("_", " ")

@@ -101,6 +101,8 @@ class Signature:
         Whether it is looked for with both encoders only.
     motor_alone : bool
         Whether it is looked for without a joint encoder only, for the baseline of both encoders holds it.
+    rotary : bool
+        Whether a linear axis has none.
     """
 
     columns: Callable[[Motion, Sequence[float]], Terms]
@@ -113,3 +115,4 @@ class Signature:
     ripple: str = ""
     needs_joint: bool = False
     motor_alone: bool = False
+    rotary: bool = False

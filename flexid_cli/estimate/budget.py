@@ -6,6 +6,7 @@ an interval does not stay narrow around a biased value.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -30,11 +31,19 @@ _NOISY_SIGNALS = frozenset({"torque", "motor", "joint", "torsion"})
 
 @dataclass(frozen=True)
 class NoiseLevels:
-    """White noise of each signal that would give the floor of its spectrum (one sigma a sample, SI)."""
+    """White noise of each signal that would give the floor of its spectrum (one sigma a sample, SI).
+
+    The torque's may fall with frequency: its density is that of a first-order low pass at ``torque_corner_hz``.
+    """
 
     torque: float
     motor_position: float
     joint_position: float
+    torque_corner_hz: float = math.inf
+
+    def torque_at(self, omega: Array) -> Array:
+        """Noise of the torque by frequency (rad/s), as white noise of the same density."""
+        return np.asarray(self.torque / np.hypot(1.0, omega / (2.0 * np.pi * self.torque_corner_hz)))
 
 
 @dataclass(frozen=True)

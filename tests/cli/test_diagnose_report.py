@@ -249,11 +249,25 @@ def test_files_that_are_no_report_are_refused(
     assert "internal error" not in result.stderr
 
 
-def test_a_log_of_a_simulator_is_refused_with_one_message(engine: Engine, log: Path, config: Path) -> None:
-    result = diagnose(log, "-c", config, "--simulation", log)
+def test_a_log_of_a_simulator_gives_the_parameters(
+    engine: Engine, log: Path, config: Path, write_log: WriteLog, columns: Columns
+) -> None:
+    simulated = write_log(columns, "sim.csv")
+    result = diagnose(log, "-c", config, "--simulation", simulated, "--json")
+    assert result.exit_code == 0, result.stderr
+    own, asked = engine.calls
+    roles = {Path(entry["path"]).name: entry["role"] for entry in json.loads(result.stdout)["inputs"]}
+    assert roles == {log.name: "recording", "sim.csv": "parameters"}
+    estimates = EXAMPLES.CASES["explained"]().parameters_after
+    assert own.known is None
+    assert asked.known == {e.symbol: e.value for e in estimates if e.value is not None}
+    assert "the simulation is not the plain model itself" in result.stderr
+
+
+def test_a_simulation_and_a_report_are_one_too_many(engine: Engine, log: Path, config: Path) -> None:
+    result = diagnose(log, "-c", config, "--simulation", log, "--report", log)
     assert (result.exit_code, result.stdout) == (2, "")
-    assert "not supported yet" in result.stderr
-    assert "--report" in result.stderr
+    assert "leave out one of the two" in result.stderr
     assert not engine.calls
 
 

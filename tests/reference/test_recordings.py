@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flexid_cli.config.load import load_config
+from flexid_cli.diagnose.diagnose import diagnose
 from flexid_cli.estimate.identify import identify
 from flexid_cli.signals.build import build_recording
 
@@ -78,3 +79,22 @@ def test_no_confident_number_where_the_model_lacks_something(root, recordings, n
     """Six axes move together on the KUKA, two stages on the Quanser: one axis's model cannot be trusted there."""
     for model in _identify(root, recordings, name).models:
         assert all(e.verdict != "identified" for e in (*model.parameters, *model.derived)), model.id
+
+
+def test_emps_has_asymmetric_friction_and_shows_it_on_the_other_record(root, recordings):
+    """Its authors' model with friction that differs by direction leaves 0.76 of what the symmetric one does.
+
+    In inverse dynamics, in the band of the tracking record's torque, with parameters fitted on that record alone.
+    """
+    config = load_config(root / "configs" / "recordings" / "emps.yaml")
+    tracking, pulses = (
+        build_recording([recordings / "real" / f"emps_{name}.csv.gz"], config)[0]
+        for name in ("tracking", "pulses")
+    )
+    found = diagnose(tracking, config, pulses)
+    assert found.model == "rigid"
+    assert found.verdict in {"explained", "partly_explained"}
+    assert found.effects[0].name == "viscous_asymmetry"
+    assert found.held_out.after["motor"] < 0.76 * found.held_out.before["motor"]
+    inertia = next(e for e in found.parameters_after if e.name == "total_inertia")
+    assert inertia.value == pytest.approx(EMPS["total_inertia"][0], rel=0.005)

@@ -8,6 +8,7 @@ import pytest
 from flexid_cli.diagnose.basis import solve
 from flexid_cli.diagnose.problem import Problem, Stretch
 from flexid_cli.diagnose.rows import Taper, Weights
+from flexid_cli.diagnose.start import MOST_FALL, _first_order
 from flexid_cli.effects.motion import Base, Terms
 from flexid_cli.estimate.budget import NoiseLevels
 from flexid_cli.signals.recording import Segment
@@ -189,3 +190,21 @@ def test_the_signal_is_the_torque_over_its_noise():
             Segment(0.0, size * rng.standard_normal(SAMPLES), zero, zero), NoiseLevels(1.0, 1e-12, 1e-12)
         )
         assert p.signal() == pytest.approx(size, rel=0.08)
+
+
+@pytest.mark.parametrize("corner", [30.0, np.inf])
+def test_the_torques_noise_is_continued_below_the_range_where_it_is_seen(corner):
+    rng = np.random.default_rng(4)
+    f = np.arange(66.0, 132.0, 1.0)
+    seen = 2.0 / (1.0 + (f / corner) ** 2) * rng.chisquare(60, f.size) / 60.0
+    level, found = _first_order(f, seen)
+    assert level == pytest.approx(2.0, rel=0.5)
+    below = level / (1.0 + (20.0 / found) ** 2)
+    assert below == pytest.approx(2.0 / (1.0 + (20.0 / corner) ** 2), rel=0.35)
+
+
+def test_a_steep_fall_is_continued_only_so_far():
+    f = np.arange(66.0, 132.0, 1.0)
+    level, _ = _first_order(f, 1e6 / f**6)
+    assert level == pytest.approx(MOST_FALL * np.median((1e6 / f**6)[:33]))
+    assert _first_order(f, np.full(f.size, 3.0)) == (3.0, np.inf)

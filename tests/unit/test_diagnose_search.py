@@ -9,7 +9,7 @@ import pytest
 
 from flexid_cli.diagnose.basis import Basis, solve
 from flexid_cli.diagnose.problem import Problem, Stretch
-from flexid_cli.diagnose.search import Candidate, Form, Search, golden
+from flexid_cli.diagnose.search import Candidate, Form, Search, gained, golden
 from flexid_cli.effects.motion import Base
 from flexid_cli.effects.registry import effect, effects
 from flexid_cli.estimate.budget import NoiseLevels
@@ -129,7 +129,7 @@ def test_shapes_are_searched_not_gridded(search, name, index, shape, size):
     assert candidate.shape[0] == pytest.approx(shape[0], rel=0.05)
     assert candidate.amplitudes[0] == pytest.approx(size, rel=0.1)
     white = solve(search.base, search.target).cost
-    assert candidate.gain > 0.9 * math.log(now.cost / white)
+    assert candidate.gain > 0.9 * gained(now.cost, white, now.residual.size)
 
 
 def test_a_sign_that_physics_forbids_is_refused(search):
@@ -179,3 +179,9 @@ def test_what_is_in_the_model_explains_nothing_more(search):
     candidate = search.evaluate(what, shape, now)
     assert candidate.gain == 0.0
     assert candidate.refused
+
+
+def test_what_lies_below_the_noise_is_no_finding():
+    assert gained(100.0, 100.0, 10) == 0.0
+    assert gained(0.5, 0.05, 10) < 0.05  # nine tenths of next to nothing
+    assert gained(1e4, 1e2, 10) == pytest.approx(math.log(100.0), rel=0.05)

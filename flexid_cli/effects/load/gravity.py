@@ -61,5 +61,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.LOAD, _torque),),
     energy="conserves",
-    signatures=(Signature(_columns, _values, motor_alone=True),),
+    signatures=(Signature(_columns, _values, motor_alone=True, rotary=True),),
 )

@@ -85,7 +85,7 @@ EFFECT = Effect(
     laws=(Law(Stage.MEASUREMENT, _measurement),),
     energy="exchanges",
     signatures=(
-        Signature(_joint, _joint_values, needs_joint=True),
-        Signature(_motor, _motor_values, _once_a_turn),
+        Signature(_joint, _joint_values, needs_joint=True, rotary=True),
+        Signature(_motor, _motor_values, _once_a_turn, rotary=True),
     ),
 )
