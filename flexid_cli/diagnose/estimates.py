@@ -92,7 +92,11 @@ def unscaled(fitted: Fitted, coefficients: Array, covariance: Array, stiffened: 
         if chosen.form.signature.fixed is None:
             G[k, fitted.columns(n)] = -fitted.slopes(n)
     out[k] -= fitted.stiffening
-    return out, G @ covariance @ G.T
+    covariance = G @ covariance @ G.T
+    for n, chosen in enumerate(fitted.chosen):
+        stiffness = float(fitted.amplitudes(n) @ fitted.slopes(n))
+        covariance[k, k] += (chosen.form.signature.form_doubt * stiffness) ** 2
+    return out, covariance
 
 
 def _bread(X: Array) -> Array:

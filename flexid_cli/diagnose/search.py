@@ -148,7 +148,7 @@ class Search:
 
     def _refused(self, form: Form, shape: tuple[float, ...], amplitudes: Array) -> str:
         """Why amplitudes are out of the question, or nothing."""
-        if form.signature.sign * amplitudes[0] < 0.0:
+        if np.any(form.signature.sign * amplitudes < 0.0):
             return "physics forbids the sign that the fit gives it"
         stiffening = float(amplitudes @ self.slopes(form, shape))
         if not LEAST_SPRING < 1.0 - stiffening / self.problem.stiffness < MOST_SPRING:

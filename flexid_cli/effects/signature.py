@@ -88,7 +88,7 @@ class Signature:
     fixed : float or None
         The amplitude where it is not free (a lag, a limit: all of it is in the shape).
     sign : {1, -1, 0}
-        Sign that physics demands of the amplitude; 0: either.
+        Sign that physics demands of all amplitudes; 0: either.
     tied : callable or None
         (amplitudes, shape values, Base) -> why these values cannot be the effect, or an empty string.
     corrected : callable or None
@@ -101,6 +101,8 @@ class Signature:
         Whether it is looked for with both encoders only.
     motor_alone : bool
         Whether it is looked for without a joint encoder only, for the baseline of both encoders holds it.
+    form_doubt : float
+        Share of its stiffness that its form leaves open: K is no surer than that.
     rotary : bool
         Whether a linear axis has none.
     """
@@ -115,4 +117,5 @@ class Signature:
     ripple: str = ""
     needs_joint: bool = False
     motor_alone: bool = False
+    form_doubt: float = 0.0
     rotary: bool = False

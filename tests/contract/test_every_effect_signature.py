@@ -25,8 +25,8 @@ FORMS = [Form(e, k) for e in effects() for k in range(len(e.signatures))]
 EVERY = pytest.mark.parametrize("form", FORMS, ids=lambda f: f"{f.name}-{f.index}")
 PLACES = ("motor", "transmission", "load", "motor_error", "joint_error")
 
-# Form, shape and amplitudes of a small effect. A slider in place of Dahl's element (hysteresis, second form) has no
-# law of its own: both are forms of one effect.
+# Form, shape and amplitudes of a small effect. Sliders in place of Dahl's element (hysteresis, further forms) have
+# no law of their own: all are forms of one effect.
 SMALL: dict[tuple[str, int], tuple[tuple[float, ...], tuple[float, ...]]] = {
     ("torque_offset", 0): ((), (0.5,)),
     ("viscous_asymmetry", 0): ((), (0.5,)),
@@ -130,7 +130,7 @@ def parts(form: Form, motion: Motion, shape: tuple[float, ...]) -> dict[str, np.
 
 def test_every_effect_has_a_signature_and_every_form_a_small_case():
     assert all(e.signatures for e in effects())
-    assert {(f.name, f.index) for f in FORMS} - set(SMALL) == {("hysteresis", 1)}
+    assert {(f.name, f.index) for f in FORMS} - set(SMALL) == {("hysteresis", 1), ("hysteresis", 2)}
 
 
 @EVERY
