@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 SETTLED = 1e-3  # change of the cost's logarithm
 WIDTH_STEPS = 6
 WIDTH_RANGE = 1.2  # of the logarithm of a reversal width, around the present one
+REVERSAL = 3.0  # widths about zero velocity that a reversal takes
 NARROWEST = 1e-5  # reversal width, rad/s or m/s
 THREADS = 2
 
@@ -157,30 +158,43 @@ class Fitter:
         return fitted.problem.moved(fitted.basis.coefficients[: len(names)], fitted.stiffening)
 
     def _widths(self, fitted: Fitted, base: Base) -> Base:
-        """Reversal widths by golden section; only the Coulomb column changes with them."""
+        """Reversal widths by golden section, of all friction that changes its sign there."""
         problem = fitted.problem
         for field, symbol in (("motor_reversal", "FSm"), ("load_reversal", "FS")):
             if symbol not in problem.names:
                 continue
-            k = problem.names.index(symbol)
-            # The motor alone is solved for steps: the misfit lacks the friction at the linearisation.
-            y = (
-                fitted.y
-                if problem.both
-                else fitted.y + getattr(problem.base, symbol) * fitted.search.base[:, k]
-            )
-            rest = solve(np.delete(fitted.basis.columns, k, axis=1), y)
-
-            def cost(u: float, field: str = field, rest: Basis = rest) -> float:
-                c = rest.outside(problem.sign_rows(field, float(np.exp(u))))
-                size = float(c @ c)
-                return rest.cost - (float(c @ rest.residual) ** 2 / size if size > 0.0 else 0.0)
-
+            friction = self._at_reversal(fitted, symbol, getattr(problem.base, field))
             now = float(np.log(getattr(problem.base, field)))
+            sign = problem.sign_rows(field, float(np.exp(now)))
+
+            def cost(u: float, field: str = field, friction: float = friction, sign: Array = sign) -> float:
+                change = problem.sign_rows(field, float(np.exp(u))) - sign
+                e = fitted.basis.outside(fitted.y - friction * change)
+                return float(e @ e)
+
             best = golden(cost, max(now - WIDTH_RANGE, np.log(NARROWEST)), now + WIDTH_RANGE, WIDTH_STEPS)
-            if cost(best) < cost(now):
+            if cost(best) < fitted.cost:
                 base = replace(base, **{field: float(np.exp(best))})
         return base
+
+    @staticmethod
+    def _at_reversal(fitted: Fitted, symbol: str, width: float) -> float:
+        """Friction about a reversal of the motor or the load: Coulomb's, and that of effects."""
+        problem = fitted.problem
+        total = problem.linearised(symbol) + float(fitted.basis.coefficients[problem.names.index(symbol)])
+        for k, c in enumerate(fitted.chosen):
+            product = size = 0.0
+            for m in problem.motions:
+                terms = c.form.signature.columns(m, c.shape)
+                motor = symbol == "FSm"
+                torque = terms.motor if motor else terms.load
+                sign, v = (m.motor_sign, m.motor_velocity) if motor else (m.joint_sign, m.joint_velocity)
+                slow = np.abs(v) < REVERSAL * width
+                if torque is not None:
+                    product += float(sign[slow] @ (torque @ fitted.amplitudes(k))[slow])
+                    size += float(sign[slow] @ sign[slow])
+            total += product / size if size > 0.0 else 0.0
+        return total
 
     def _shift(self, fitted: Fitted) -> float:
         if len(self.shifts) == 1:
