@@ -262,6 +262,8 @@ class _Report:
         if self.verdict == "inconclusive":
             return "the record is too poor to judge"
         if name in {c.name for c in self.selection.after.chosen}:
+            if not self.selection.after.is_possible:
+                return "with it an inertia or the stiffness comes out negative"
             return "with it the model still leaves structure that it does not explain"
         if name in {f.chosen[-1].name for group in self.selection.alternatives for f in group}:
             return "explains the record as well as the effect that was named: an alternative"

@@ -78,6 +78,18 @@ class Fitted:
         """Stiffness of the chosen effects, which K of the columns holds too."""
         return float(sum(self.amplitudes(k) @ self.slopes(k) for k in range(len(self.chosen))))
 
+    @property
+    def is_possible(self) -> bool:
+        """Whether inertias and stiffness are positive."""
+        names, problem = self.problem.names, self.problem
+        strong = {
+            n: problem.linearised(n) + float(self.basis.coefficients[names.index(n)])
+            for n in ("Jm", "K", "JL")
+            if n in names
+        }
+        strong["K"] = strong.get("K", np.inf) - self.stiffening
+        return min(strong.values()) > 0.0
+
     def slopes(self, k: int) -> Array:
         """Stiffness of the k-th chosen effect for unit amplitudes."""
         chosen = self.chosen[k]

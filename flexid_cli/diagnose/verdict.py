@@ -68,6 +68,8 @@ def decide(selection: Selection, left: Remainder) -> Verdict:
     astray = not problem.settled and bool(left or not chosen)
     if is_poor(problem) or astray:
         return "inconclusive"
+    if not selection.after.is_possible:  # a fit, but of no axis
+        return "unexplained" if left or chosen else "inconclusive"
     if left == "function" or (left and not chosen):
         return "unexplained"
     if not chosen:

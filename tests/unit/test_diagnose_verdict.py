@@ -15,11 +15,13 @@ def found(gain: float) -> Map:
     return Map("motor", "velocity", gain, np.zeros(1), np.zeros(1), np.zeros(1), plain=True)
 
 
-def selection(names: list[str], *, settled: bool = True, signal: float = 100.0) -> SimpleNamespace:
+def selection(
+    names: list[str], *, settled: bool = True, signal: float = 100.0, possible: bool = True
+) -> SimpleNamespace:
     problem = SimpleNamespace(settled=settled, signal=lambda: signal)
     return SimpleNamespace(
         before=SimpleNamespace(problem=problem),
-        after=SimpleNamespace(chosen=names),
+        after=SimpleNamespace(chosen=names, is_possible=possible),
         alternatives=[()] * len(names),
     )
 
@@ -51,6 +53,11 @@ def test_a_start_that_cannot_be_trusted_is_inconclusive_unless_an_effect_explain
     assert decide(selection(["cogging"], settled=False), "size") == "inconclusive"
     assert decide(selection(["cogging"], settled=False), "") == "explained"
     assert decide(selection(["cogging"], signal=1.0), "") == "inconclusive"
+
+
+def test_a_fit_with_a_negative_stiffness_explains_nothing():
+    assert decide(selection(["cogging"], possible=False), "") == "unexplained"
+    assert decide(selection([], possible=False), "") == "inconclusive"
 
 
 def test_a_part_that_stays_is_told_with_its_place():
