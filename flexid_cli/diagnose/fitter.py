@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 SETTLED = 1e-3  # change of the cost's logarithm
 WIDTH_STEPS = 6
 WIDTH_RANGE = 1.2  # of the logarithm of a reversal width, around the present one
+REVERSALS = {"motor_reversal": "FSm", "load_reversal": "FS"}  # widths of the base and their friction
 REVERSAL = 3.0  # widths about zero velocity that a reversal takes
 NARROWEST = 1e-5  # reversal width, rad/s or m/s
 THREADS = 2
@@ -89,6 +90,24 @@ class Fitted:
         }
         strong["K"] = strong.get("K", np.inf) - self.stiffening
         return min(strong.values()) > 0.0
+
+    def at_reversal(self, symbol: str, width: float) -> float:
+        """Friction about a reversal of the motor or the load: Coulomb's, and that of effects."""
+        problem = self.problem
+        total = problem.linearised(symbol) + float(self.basis.coefficients[problem.names.index(symbol)])
+        for k, c in enumerate(self.chosen):
+            product = size = 0.0
+            for m in problem.motions:
+                terms = c.form.signature.columns(m, c.shape)
+                motor = symbol == "FSm"
+                torque = terms.motor if motor else terms.load
+                sign, v = (m.motor_sign, m.motor_velocity) if motor else (m.joint_sign, m.joint_velocity)
+                slow = np.abs(v) < REVERSAL * width
+                if torque is not None:
+                    product += float(sign[slow] @ (torque @ self.amplitudes(k))[slow])
+                    size += float(sign[slow] @ sign[slow])
+            total += product / size if size > 0.0 else 0.0
+        return total
 
     def slopes(self, k: int) -> Array:
         """Stiffness of the k-th chosen effect for unit amplitudes."""
@@ -172,10 +191,10 @@ class Fitter:
     def _widths(self, fitted: Fitted, base: Base) -> Base:
         """Reversal widths by golden section, of all friction that changes its sign there."""
         problem = fitted.problem
-        for field, symbol in (("motor_reversal", "FSm"), ("load_reversal", "FS")):
+        for field, symbol in REVERSALS.items():
             if symbol not in problem.names:
                 continue
-            friction = self._at_reversal(fitted, symbol, getattr(problem.base, field))
+            friction = fitted.at_reversal(symbol, getattr(problem.base, field))
             now = float(np.log(getattr(problem.base, field)))
             sign = problem.sign_rows(field, float(np.exp(now)))
 
@@ -188,25 +207,6 @@ class Fitter:
             if cost(best) < fitted.cost:
                 base = replace(base, **{field: float(np.exp(best))})
         return base
-
-    @staticmethod
-    def _at_reversal(fitted: Fitted, symbol: str, width: float) -> float:
-        """Friction about a reversal of the motor or the load: Coulomb's, and that of effects."""
-        problem = fitted.problem
-        total = problem.linearised(symbol) + float(fitted.basis.coefficients[problem.names.index(symbol)])
-        for k, c in enumerate(fitted.chosen):
-            product = size = 0.0
-            for m in problem.motions:
-                terms = c.form.signature.columns(m, c.shape)
-                motor = symbol == "FSm"
-                torque = terms.motor if motor else terms.load
-                sign, v = (m.motor_sign, m.motor_velocity) if motor else (m.joint_sign, m.joint_velocity)
-                slow = np.abs(v) < REVERSAL * width
-                if torque is not None:
-                    product += float(sign[slow] @ (torque @ fitted.amplitudes(k))[slow])
-                    size += float(sign[slow] @ sign[slow])
-            total += product / size if size > 0.0 else 0.0
-        return total
 
     def _shift(self, fitted: Fitted) -> float:
         if len(self.shifts) == 1:
