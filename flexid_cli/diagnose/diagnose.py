@@ -158,7 +158,7 @@ class _Report:
         """Why no parameter counts as identified, or nothing."""
         if verdict.is_poor(self.selection.before.problem):
             return "the torque hardly stands above its own noise"
-        if self.verdict == "unexplained":
+        if self.verdict in ("unexplained", "partly_explained"):
             return "the model leaves out something that is not known"
         if not self.final.problem.both and not self.final.problem.settled:
             return "no resonance stands out of the record, so the motor encoder alone does not show the stiffness"

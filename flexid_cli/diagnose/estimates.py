@@ -78,7 +78,7 @@ def solved(fitted: Fitted) -> Solved:
     if not problem.both and not problem.rigid:
         covariance = ALONE_SPREAD**2 * covariance
     if problem.both:
-        whole, covariance = unscaled(fitted, whole, covariance, stiffened)
+        whole, covariance = _unscaled(fitted, whole, covariance, stiffened)
     return Solved(whole, covariance[:p, :p], robust.degrees_of_freedom[:p])
 
 
@@ -93,7 +93,9 @@ def _width_tangents(fitted: Fitted) -> Array:
     return np.hstack(found)
 
 
-def unscaled(fitted: Fitted, coefficients: Array, covariance: Array, stiffened: Array) -> tuple[Array, Array]:
+def _unscaled(
+    fitted: Fitted, coefficients: Array, covariance: Array, stiffened: Array
+) -> tuple[Array, Array]:
     """The load's parameters without the factor K0 / K of `Problem`, and K without the effects' stiffness.
 
     ``covariance`` holds the shapes behind the coefficients; by them the effects' stiffness changes by ``stiffened``.

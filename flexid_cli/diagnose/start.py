@@ -67,7 +67,12 @@ def first_problem(
     base = (_both_base if both else _rigid_base)(stretches, width)
     if rigid:
         base = replace(
-            base, K=_rigid_stiffness(base, band), FVm=2.0 * base.FVm, FV=0.0, FSm=base.FSm + base.FS, FS=0.0
+            base,
+            K=_rigid_stiffness(base, band),
+            FVm=base.FVm + base.FV,
+            FV=0.0,
+            FSm=base.FSm + base.FS,
+            FS=0.0,
         )
     problem = Problem(
         stretches,

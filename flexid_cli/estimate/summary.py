@@ -286,6 +286,9 @@ def _derived(solution: Solution, config: Config, uncertainty: Uncertainty) -> tu
     symbols = tuple(p.symbol for p in solution.model.parameters)
     if "K" not in symbols:
         return ()
+    strong = {symbols.index(s) for s in ("Jm", "K", "JL")}
+    if strong & set(solution.result.dependent):  # they may be zero then
+        return ()
     theta = solution.reported.theta
     values = dict(zip(symbols, (float(x) for x in theta), strict=True))
     found = []

@@ -185,9 +185,8 @@ def in_order(
                 waiting.append(item)
             else:
                 waiting.append(_Ahead(item, pool.submit(parse, item.text)))
-            while (
-                len(waiting) > threads
-            ):  # one more than are parsed, so that no thread has to wait for the next
+            # One more than are parsed, so that no thread has to wait for the next.
+            while len(waiting) > threads:
                 yield _next(waiting, parse)
         while waiting:
             yield _next(waiting, parse)
