@@ -24,6 +24,7 @@ import fnmatch
 import json
 import math
 import multiprocessing
+import os
 import sys
 import time
 from collections import defaultdict
@@ -289,7 +290,12 @@ def run_all(pattern: str, records: int, results: Path, jobs: int) -> None:
     if results.exists() and not results.read_bytes().endswith(b"\n"):
         with results.open("a", encoding="utf-8") as file:
             file.write("\n")
-    with results.open("a", encoding="utf-8") as file, multiprocessing.Pool(jobs) as pool:
+    # One thread a process: the cores are taken already.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with (
+        results.open("a", encoding="utf-8") as file,
+        multiprocessing.get_context("spawn").Pool(jobs) as pool,
+    ):
         for lines in pool.imap_unordered(_work, tasks):
             file.writelines(json.dumps(line) + "\n" for line in lines)
             file.flush()

@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 
     from click.shell_completion import CompletionItem
 
+# Matrices here are tall and narrow: threads of the linear algebra gain nothing on them, wait for each other where
+# the processors are busy (a diagnosis took three times as long), and make the last digits depend on the machine.
+# It counts only for who has not said otherwise, and only before numpy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 PROGRAM = "flexid"
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130

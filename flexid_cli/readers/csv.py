@@ -373,8 +373,6 @@ class _Table:
         offset = next(iter(columns.values())).size if columns else 0
         account = _Account(self.path, self.dialect.first_line, offset)
         expected = offset + int(1.02 * _size(self.path) / self._line_bytes) + 64
-        import pandas  # noqa: F401, ICN001 - here, for threads must not import it at the same time
-
         with closing(self._rows(tuple(columns), account, options.threads, progress.advance)) as blocks:
             for rows in blocks:
                 account.refuse(strict=options.strict)

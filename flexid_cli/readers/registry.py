@@ -44,7 +44,7 @@ def open_reader(paths: Sequence[Path], csv: CsvOptions | None = None) -> Reader:
     """
     if not paths:
         raise InputError("no log is given", _FORMATS)
-    _refuse_doubles(paths)
+    refuse_doubles(paths)
     found = [(path, _reader_of(path, csv)) for path in paths]
     names = {reader.name for _, reader in found}
     if len(names) > 1:
@@ -112,7 +112,8 @@ def _check_clock(log: RawLog, clock: str) -> None:
             )
 
 
-def _refuse_doubles(paths: Sequence[Path]) -> None:
+def refuse_doubles(paths: Sequence[Path]) -> None:
+    """Raise InputError where a file is given twice."""
     seen: set[Path] = set()
     for path in paths:
         real = path.resolve()

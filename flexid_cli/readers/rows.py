@@ -9,7 +9,8 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,10 @@ from flexid_cli.readers.dialect import MISSING, WHITESPACE, Dialect, is_missing,
 if TYPE_CHECKING:
     import pandas as pd
 
-# To look up each field among the words for a missing value takes time; most logs need none.
-_SOME_MISSING = list(MISSING)
-_NONE_MISSING = [""]
-_LOOK = 1 << 12
 _LONGEST_SPLIT = 1 << 17  # characters; the csv module takes no longer field
 _SLICE = 1 << 18  # bytes whose masks stay in the processor's cache
-_PLUS = ord("+")  # of the characters below it, a table of numbers has line ends only (and delimiters)
+_PLUS = ord("+")  # the compiled reader refuses every character below it but a separator
+_one_at_a_time = threading.Lock()  # for the import of pandas
 _NOT_TEXT = re.compile(r"[\x00-\x08\x0e-\x19\x1b-\x1f\ufffd\ud800-\udfff]")
 _NEGATIVE_ZERO = re.compile(rb"-0+(?![0-9.])")
 
@@ -88,108 +86,29 @@ class RowReader:
         self._dialect = dialect
         self._encoding = encoding
         self._wanted = wanted
-        self._missing = _NONE_MISSING
-        self._local = threading.local()
 
     def __call__(self, text: bytes) -> Rows:
         """Read a block of whole lines, each with a line feed at its end, below the header."""
         dialect, wanted = self._dialect, self._wanted
         simple = _simplified(text, dialect)
         if not any(mark[:1] in simple and mark in simple for mark in _high_marks(dialect)):
-            rows = self._read_bare(simple) if wanted else None
+            rows = _read_bare(simple, dialect, wanted) if wanted else None
             if rows is None:
                 rows = _read_plain(simple, dialect, wanted)
             if rows is not None:
                 return rows
         return _read_any(text, dialect, self._encoding, wanted)
 
-    def _read_bare(self, text: bytes) -> Rows | None:
-        """Read a block that has nothing but fields, delimiters and line feeds; else return None.
-
-        The parser neither tells lines with too few fields from such with missing ones, nor minds too many. But
-        where there are as many separators as the lines need, and no parsed line lacks its last field, none
-        can have too many; and a quote, comment, carriage return or zero byte would be one too many.
-        """
-        lines = _count_bare(text, self._dialect)
-        if lines is None:
-            return None
-        stream: _Stream | None = getattr(self._local, "stream", None)
-        if stream is None or stream.missing is not self._missing:
-            stream = self._local.stream = _Stream(self._dialect, self._wanted, self._missing)
-        frame = stream.parse(text, lines)
-        rows = None if frame is None else _checked(frame, text, self._dialect, self._wanted)
-        if rows is None:
-            self._local.stream = None  # it may be in the middle of a line
-            if b"N" in text or b"n" in text:
-                self._missing = _SOME_MISSING
-        return rows
-
 
 # --- lines of plain numbers ------------------------------------------------------------
 
 
-class _Feed(io.RawIOBase):
-    """One block after the other, as a file."""
+def _read_bare(text: bytes, dialect: Dialect, wanted: Sequence[int]) -> Rows | None:
+    """Read a block that has nothing but numbers, delimiters and line feeds; else return None."""
+    from flexid_cli.readers.digits import read_numbers
 
-    _text = b""
-    _place = 0
-
-    def readable(self) -> bool:
-        return True
-
-    def put(self, text: bytes) -> None:
-        """Replace the block."""
-        self._text, self._place = text, 0
-
-    def read(self, size: int = -1, /) -> bytes:
-        start = self._place
-        self._place = len(self._text) if size < 0 else min(start + size, len(self._text))
-        return self._text[start : self._place]
-
-    @property
-    def is_done(self) -> bool:
-        """Whether all of the block was read."""
-        return self._place == len(self._text)
-
-
-class _Stream:
-    """A parser that is kept from block to block, for to make one takes a fifth of the time of a block."""
-
-    def __init__(self, dialect: Dialect, wanted: Sequence[int], missing: Sequence[str]) -> None:
-        self.missing = missing
-        self._how = _how(dialect, {*wanted, len(dialect.fields) - 1}, spaces=False, missing=missing)
-        self._feed = _Feed()
-        self._parser: pd.io.parsers.TextFileReader | None = None
-
-    def parse(self, text: bytes, lines: int) -> pd.DataFrame | None:
-        """Parse a block of ``lines`` lines; None where that fails, and the parser is of no use any more."""
-        import pandas as pd
-
-        self._feed.put(text)
-        try:
-            if self._parser is None:
-                self._parser = pd.read_csv(self._feed, iterator=True, **self._how)
-            frame = self._parser.get_chunk(lines)
-        except (pd.errors.ParserError, ValueError, OverflowError, StopIteration):
-            return None
-        return frame if len(frame) == lines and self._feed.is_done else None
-
-
-def _count_bare(text: bytes, dialect: Dialect) -> int | None:
-    """Count the lines of a block by what separates fields and lines; None where it cannot be bare.
-
-    In a bare block these are the only characters below the digits (and signs and points). The number is right
-    where it is that of the parsed lines and each of them has its last field: then no separator is left over
-    for another line, nor is any of them something else.
-    """
-    width, delimiter = len(dialect.fields), ord(dialect.delimiter)
-    if delimiter > ord(","):
-        lines = _count_if(text, np.less, _PLUS)
-        return lines if _count_if(text, np.equal, delimiter) == lines * (width - 1) else None
-    low = _count_if(text, np.less, max(_PLUS, delimiter + 1))
-    if delimiter == ord(",") and (low % width or b"+" in text[:_LOOK]):
-        low -= text.count(b"+")
-    return None if low % width or not low else low // width
+    found = read_numbers(text, dialect.delimiter, dialect.decimal, len(dialect.fields), tuple(wanted))
+    return None if found is None else Rows(found[1], found[0], found[0])
 
 
 def _read_plain(text: bytes, dialect: Dialect, wanted: Sequence[int]) -> Rows | None:
@@ -303,21 +222,26 @@ def _parse(
     text: bytes, dialect: Dialect, places: Iterable[int], dtype: str | None = None
 ) -> pd.DataFrame | None:
     """Parse columns with pandas; None where it refuses."""
-    import pandas as pd
-
-    how = _how(dialect, places, spaces=True, missing=_SOME_MISSING)
+    pandas = _pandas()
+    how = _how(dialect, places)
     if dtype is not None:
         how["dtype"] = dtype
     if not text.isascii():
         how["encoding_errors"] = "surrogateescape"
     try:
-        frame: pd.DataFrame = pd.read_csv(io.BytesIO(text), **how)
-    except (pd.errors.ParserError, ValueError, OverflowError):
+        return cast("pd.DataFrame", pandas.read_csv(io.BytesIO(text), **how))
+    except (pandas.errors.ParserError, ValueError, OverflowError):
         return None
-    return frame
 
 
-def _how(dialect: Dialect, places: Iterable[int], *, spaces: bool, missing: Sequence[str]) -> dict[str, Any]:
+def _pandas() -> ModuleType:
+    """Import pandas, which two threads must not do at the same time."""
+    with _one_at_a_time:
+        import pandas as pd
+    return pd
+
+
+def _how(dialect: Dialect, places: Iterable[int]) -> dict[str, Any]:
     """Return what tells pandas how a table is written."""
     return {
         "sep": dialect.delimiter,
@@ -326,9 +250,9 @@ def _how(dialect: Dialect, places: Iterable[int], *, spaces: bool, missing: Sequ
         "names": list(range(len(dialect.fields))),
         "index_col": False,
         "usecols": sorted(places),
-        "na_values": missing,
+        "na_values": list(MISSING),
         "keep_default_na": False,
-        "skipinitialspace": spaces,
+        "skipinitialspace": True,
         "skip_blank_lines": False,
         "low_memory": False,
         **_exact_floats(),
@@ -338,9 +262,8 @@ def _how(dialect: Dialect, places: Iterable[int], *, spaces: bool, missing: Sequ
 @cache
 def _exact_floats() -> Mapping[str, Any]:
     """Ask for correctly rounded numbers where that is not the parser's only way."""
-    import pandas as pd
-
-    major, minor = (int(part) for part in pd.__version__.split(".")[:2])
+    pandas = _pandas()
+    major, minor = (int(part) for part in pandas.__version__.split(".")[:2])
     return {} if (major, minor) >= (3, 1) else {"float_precision": "round_trip"}
 
 

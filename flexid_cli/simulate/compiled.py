@@ -1,14 +1,14 @@
-"""Compilation: torque laws to machine addresses, kernels to cached machine code."""
+"""Compilation of torque laws to machine addresses, and what kernels need to call them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from threading import Lock
 from typing import Any
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import cfunc, njit, types
+from numba import cfunc, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -16,14 +16,6 @@ from flexid_cli.effects.base import Effect, Stage, TorqueLaw
 
 _POINTER = types.CPointer(types.float64)  # type: ignore[no-untyped-call]
 _SIGNATURE = types.void(*(_POINTER,) * 5)
-
-
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile on first use, without the interpreter's lock, cached on disk where a place can be written."""
-    try:
-        return njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:  # no place for the cache: compile anew in every process
-        return njit(nogil=True, error_model="numpy")(function)
 
 
 _laws: dict[TorqueLaw, Any] = {}

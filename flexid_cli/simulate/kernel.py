@@ -16,7 +16,8 @@ import math
 import numpy as np
 
 from flexid_cli.effects import slots
-from flexid_cli.simulate.compiled import call_law, compiled, pointer, shifted
+from flexid_cli.jit import compiled
+from flexid_cli.simulate.compiled import call_law, pointer, shifted
 
 # Status of a run
 DONE, UNSTABLE, TOO_MANY_STEPS, TOO_MANY_EVENTS = 0, 1, 2, 3
