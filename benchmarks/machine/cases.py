@@ -24,10 +24,12 @@ from .effects import (
     BOTH_ENCODERS,
     MOTOR_ONLY,
     OUTSIDE_KINDS,
+    PAPER_KINDS,
     Effect,
     Parameters,
     Scene,
     applied,
+    at_rest,
     share,
     variants,
     visible,
@@ -52,10 +54,13 @@ NOT_TOGETHER = (
 )
 FIRST_SEED = {"calibration": 1_000_000, "test": 5_000_000}
 LIST_OFFSET = {"singles": 0, "nulls": 100_000, "pairs": 200_000, "motor_only": 300_000, "outside": 400_000}
+LIST_OFFSET["paper"] = 500_000
 # As many as it takes for a perfect score to pass its Wilson bound, and one slip more.
 SINGLES_PER_KIND = 16
 MOTOR_ONLY_PER_KIND = 10
 OUTSIDE_PER_KIND = 13
+PAPER_PER_KIND = 16
+NEAR_REST = 0.3  # of the usual travel
 LISTS = tuple(LIST_OFFSET)
 
 
@@ -72,6 +77,7 @@ class Task:
     seed: int
     motor_only: bool = False
     seconds: tuple[float, float] = (30.0, 45.0)
+    near_rest: bool = False
 
     @property
     def name(self) -> str:
@@ -112,14 +118,15 @@ def tasks(group: str, seeds: str) -> list[Task]:
 
     Parameters
     ----------
-    group : {"singles", "nulls", "pairs", "motor_only", "outside"}
+    group : {"singles", "nulls", "pairs", "motor_only", "outside", "paper"}
     seeds : {"calibration", "test"}
     """
     first = FIRST_SEED[seeds] + LIST_OFFSET[group]
     kinds = list(_kinds(group, first))
     # Shuffled, so that the first few of a list are a fair sample of it.
     order = np.random.default_rng(first).permutation(len(kinds))
-    return [Task(group, kinds[k], first + int(k), group == "motor_only") for k in order]
+    alone, paper = group in ("motor_only", "paper"), group == "paper"
+    return [Task(group, kinds[k], first + int(k), alone, near_rest=paper) for k in order]
 
 
 def _kinds(group: str, first: int) -> Iterator[tuple[str, ...]]:
@@ -134,6 +141,8 @@ def _kinds(group: str, first: int) -> Iterator[tuple[str, ...]]:
         yield from ((k,) for k in (*MOTOR_ONLY, NONE, NONE) for _ in range(MOTOR_ONLY_PER_KIND))
     elif group == "outside":
         yield from ((k,) for k in OUTSIDE_KINDS for _ in range(OUTSIDE_PER_KIND))
+    elif group == "paper":
+        yield from (kinds for kinds in PAPER_KINDS for _ in range(PAPER_PER_KIND))
     else:
         raise KeyError(group)
 
@@ -202,6 +211,8 @@ def _attempt(task: Task, attempt: int, known: Recipe | None) -> Case:
     axis, extra, hidden, sizes = machine.plant.axis, {}, [], []
     for k, kind in enumerate(kind for kind in task.kinds if kind != NONE):
         effect, parameters = _drawn(rng, kind, scene)
+        if task.near_rest:
+            parameters = at_rest(kind, parameters)
         wanted = float(rng.uniform(*effect.shares))
         if known is None:
             size, found = _size(effect, wanted, _measure(machine, effect, parameters, ideal))
@@ -225,6 +236,8 @@ def _machine(rng: np.random.Generator, task: Task) -> _Machine:
     shapes = TRAJECTORIES[rng.choice(len(TRAJECTORIES), p=TRAJECTORY_ODDS)]
     if task.motor_only:  # about the rest position, as the paper advises
         plant = replace(plant, limits=replace(plant.limits, centre=0.0))
+    if task.near_rest:  # a small motion, in which its friction weighs more
+        plant = replace(plant, limits=replace(plant.limits, travel=NEAR_REST * plant.limits.travel))
     high = draw.high_hz(plant.axis)
     paths = [
         draw.reference(

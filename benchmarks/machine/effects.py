@@ -17,6 +17,9 @@ from .axis import Axis, Record, rms
 
 Parameters = dict[str, float]
 
+DROPPED_FRICTION = "dropped_friction"
+DROPPED_BAND = 1.4  # times the first resonance: where the paper's decimation ends (5.4 Hz over 3.9 Hz)
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -109,6 +112,8 @@ def applied(axis: Axis, parameters: Mapping[str, float]) -> tuple[Axis, Paramete
 def share(effect: Effect, record: Record, axis: Axis) -> float:
     """Size of an effect in a record with ideal sensors in which it acts alone."""
     means = record.truth.means
+    if effect.kind == DROPPED_FRICTION:
+        return _dropped_friction(record, axis) / record.truth.torque_rms
     if effect.kind == "gravity":
         load = axis.gravity * (axis.MX * means["cos_q"] + axis.MY * means["sin_q"])
         return rms(load) / rms(means["T"])
@@ -122,6 +127,27 @@ def share(effect: Effect, record: Record, axis: Axis) -> float:
         added = added - column * float(column @ added) / float(column @ column)
     reference = record.truth.acting_torque if effect.where == "motor" else means["T"]
     return rms(added) / rms(reference)
+
+
+def _dropped_friction(record: Record, axis: Axis) -> float:
+    """RMS of the friction that the paper leaves out of eq. (18): FSm (X2 S' + X1 S'') + FS sgn q'.
+
+    Below `DROPPED_BAND`, for a sign's derivatives have no size but in a band.
+    """
+    means = record.truth.means
+    omega = 2.0 * np.pi * np.fft.rfftfreq(means["sgn_m"].size, 1.0 / record.rate_hz)
+    through = (1j * axis.FV * omega - axis.JL * omega**2) / axis.K
+    dropped = axis.FSm * through * np.fft.rfft(means["sgn_m"]) + axis.FS * np.fft.rfft(means["sgn_l"])
+    dropped[omega > 2.0 * np.pi * DROPPED_BAND * axis.free_hz] = 0.0
+    return rms(np.fft.irfft(dropped, means["sgn_m"].size))
+
+
+def at_rest(kind: str, parameters: Parameters) -> Parameters:
+    """The same moment of gravity with its rest position, hanging or upright, at zero (eq. 17 of the paper)."""
+    if kind != "gravity":
+        return parameters
+    moment = float(np.hypot(parameters["MX"], parameters["MY"]))
+    return {"MX": 0.0, "MY": float(np.copysign(moment, parameters["MY"]))}
 
 
 def visible(record: Record, axis: Axis) -> float:
@@ -155,7 +181,7 @@ def variants(kind: str) -> list[Effect]:
     KeyError
         There is no such kind.
     """
-    found = [effect for effect in (*LIBRARY, *OUTSIDE) if effect.kind == kind]
+    found = [effect for effect in (*LIBRARY, *OUTSIDE, *PAPER) if effect.kind == kind]
     if not found:
         raise KeyError(kind)
     return found
@@ -302,6 +328,10 @@ def _motor_eccentricity(rng: np.random.Generator, scene: Scene) -> Parameters:
     return {"mecc_a": 0.1 * scene.torsion, "mecc_n": scene.gear_ratio, "mecc_p": _phase(rng)}
 
 
+def _coulomb(rng: np.random.Generator, scene: Scene) -> Parameters:  # noqa: ARG001
+    return {"FSm": scene.axis.FSm, "FS": scene.axis.FS}
+
+
 def _end_stop(rng: np.random.Generator, scene: Scene) -> Parameters:
     at = scene.low + float(rng.uniform(0.65, 0.9)) * (scene.high - scene.low)
     return {"stop_k": scene.joint_torque / (scene.high - scene.low), "stop_q": at}
@@ -394,6 +424,11 @@ OUTSIDE = (
     Effect("drive_dead_zone", "motor", _dead_zone, ("dead",), shares=(0.04, 0.15)),
     Effect("position_inertia", "load", _position_inertia, ("ji_a",), absorbed="q_dd", shares=(0.04, 0.15)),
 )
+
+# What the paper itself leaves out of eqs. (18) to (20) beside gravity: the friction's terms that pass the spring.
+PAPER = (Effect(DROPPED_FRICTION, "load", _coulomb, ("FSm", "FS")),)
+# Gravity and an offset are not asked for together: over a small motion MX g cos q is a constant, too.
+PAPER_KINDS = ((DROPPED_FRICTION,), ("gravity",), ("torque_offset",), (DROPPED_FRICTION, "gravity"))
 
 KINDS = tuple(dict.fromkeys(effect.kind for effect in LIBRARY))
 OUTSIDE_KINDS = tuple(dict.fromkeys(effect.kind for effect in OUTSIDE))

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from flexid_cli.cli.effect_names import as_written, complete_effects
 from flexid_cli.cli.options import example, json_option
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from click.shell_completion import CompletionItem
 
     from flexid_cli.effects.base import Effect, EffectParameter
 
@@ -23,19 +22,11 @@ INDENT = "  "
 FAR = 1e6  # a bound from here on is none that physics sets
 
 
-def _complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    from click.shell_completion import CompletionItem
-
-    from flexid_cli.effects.registry import effects
-
-    return [CompletionItem(effect.name) for effect in effects() if effect.name.startswith(incomplete)]
-
-
 @click.command(
     short_help="Say what an effect is, and what to do about it.",
     epilog=example("flexid explain backlash", "flexid explain FX204"),
 )
-@click.argument("effect", shell_complete=_complete)
+@click.argument("effect", shell_complete=complete_effects)
 @json_option
 def explain(effect: str, as_json: bool) -> None:
     """Print what the library says of EFFECT (a name or a code).
@@ -46,18 +37,12 @@ def explain(effect: str, as_json: bool) -> None:
     from flexid_cli.cli.effects import facts
     from flexid_cli.effects.registry import effect as find
 
-    found = find(_as_written(effect))
+    found = find(as_written(effect))
     if as_json:
         click.echo(json.dumps(facts(found), indent=2, allow_nan=False))
         return
     for line in _lines(found):
         click.echo(line)
-
-
-def _as_written(word: str) -> str:
-    """Name or code as the library writes it, however the user did."""
-    plain = word.strip().lower().replace("-", "_").replace(" ", "_")
-    return plain.upper() if plain.startswith("fx") else plain
 
 
 def _lines(effect: Effect) -> Iterator[str]:

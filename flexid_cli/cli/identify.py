@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from flexid_cli.cli.effect_names import complete_effects, load_config_with_effects, with_override
 from flexid_cli.cli.files import STDOUT, check_outputs, write_text_atomic
 from flexid_cli.cli.options import (
     Console,
@@ -20,6 +22,7 @@ from flexid_cli.cli.options import (
     verbosity_options,
 )
 from flexid_cli.cli.reading import read_options, reading
+from flexid_cli.cli.records import left_out, records_option, run_records, tell_of_records
 from flexid_cli.cli.reports import QUIETEST, input_files, show_report, tell_of_reading, write_reports
 
 if TYPE_CHECKING:
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from flexid_cli.estimate.result import Identification
     from flexid_cli.readers.base import RawLog, ReadOptions
     from flexid_cli.signals.recording import Recording
+    from flexid_cli.signals.records import Mode, Records
 
 NOTHING_IDENTIFIED = 3
 
@@ -39,6 +43,7 @@ NOTHING_IDENTIFIED = 3
     epilog=example(
         "flexid identify sample_logs/axis3.mcap --config configs/axis3.yaml",
         "flexid identify sample_logs/axis3.bag -c configs/axis3.yaml -o report.md",
+        "flexid identify sample_logs/axis3.csv -c configs/axis3.yaml --with cogging",
     ),
 )
 @click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="LOG...")
@@ -49,6 +54,21 @@ NOTHING_IDENTIFIED = 3
     help="direct: fit the physical parameters, all terms kept (default); paper: reproduce the tables of Pham,"
     " Gautier and Poignet, two sigma and Table 3's inversion included.",
 )
+@click.option(
+    "--with",
+    "effects",
+    multiple=True,
+    metavar="EFFECT,...",
+    shell_complete=complete_effects,
+    help="Effects of the library that join the models (`flexid effects` lists them); the report has the"
+    " parameters with and without them.",
+)
+@click.option(
+    "--essential",
+    is_flag=True,
+    help="Set friction, gravity and offsets that the data cannot tell from zero to zero, and fit the rest again.",
+)
+@records_option
 @set_option
 @read_options
 @json_option
@@ -61,6 +81,9 @@ def identify(
     logs: tuple[Path, ...],
     config: Path,
     route: str | None,
+    effects: tuple[str, ...],
+    essential: bool,
+    records_mode: Mode,
     overrides: tuple[str, ...],
     start: float | None,
     end: float | None,
@@ -73,22 +96,24 @@ def identify(
     """Estimate stiffness, inertias, friction and gravity of one axis from LOG, with confidence intervals.
 
     LOG is a CSV (also .gz, .zst), an MCAP, a rosbag2 folder or .db3, or a ROS 1 .bag; several LOGs are the files
-    of one run. The report goes to the terminal, and with -o to .json and .md files (figures as SVG beside the
-    Markdown); -o - prints the JSON instead, and -qq prints no report. Exit code 3: the data do not determine any
-    parameter.
+    of one run, or records of one axis that are fitted together (--records). The report goes to the terminal, and with
+    -o to .json and .md files (figures as SVG beside the Markdown); -o - prints the JSON instead, and -qq prints no
+    report. Exit code 3: the data do not determine any parameter.
     """
-    from flexid_cli.config.load import load_config
     from flexid_cli.report.write import check_formats
-    from flexid_cli.signals.build import build_recording
+    from flexid_cli.signals.records import read_records
 
     check_formats([path for path in outputs if path != STDOUT])
     check_outputs(outputs, force=force, inputs=[*logs, config])
     if route is not None:
         overrides = (*overrides, f"estimate.route={route}")
-    loaded = load_config(config, overrides)
+    if essential:
+        overrides = (*overrides, "estimate.essential=true")
+    overrides = (*overrides, *with_override(effects))
+    loaded = load_config_with_effects(config, overrides)
     with reading(console, start, end, strict=strict, keep_suspect=keep_suspect) as options:
-        recording, raw = build_recording(logs, loaded, options)
-    identification, document = run_identify(logs, loaded, console, recording, raw, options)
+        found = read_records(logs, loaded, options, records_mode)
+    identification, document = _run(found, loaded, console, options)
     write_reports(
         [path for path in outputs if path != STDOUT], document, identification, console, force=force
     )
@@ -106,6 +131,17 @@ def identify(
         raise SystemExit(NOTHING_IDENTIFIED)
 
 
+def _run(
+    found: Records, config: Config, console: Console, options: ReadOptions
+) -> tuple[Identification, dict[str, Any]]:
+    tell_of_records(console, found)
+    if len(found.records) > 1:
+        return run_records(found, config, console, options)
+    [one] = found.records
+    notes = (*left_out(found), *one.recording.notes)
+    return run_identify(one.paths, config, console, replace(one.recording, notes=notes), one.raw, options)
+
+
 def run_identify(
     logs: Sequence[Path],
     config: Config,
@@ -116,11 +152,10 @@ def run_identify(
 ) -> tuple[Identification, dict[str, Any]]:
     """Identify, and build the report document."""
     from flexid_cli.config.load import config_digest
-    from flexid_cli.estimate.identify import identify as estimate
     from flexid_cli.report.document import build_document
 
     tell_of_reading(console, recording, raw, options)
-    identification = estimate(recording, config)
+    identification = _estimate(recording, config)
     document = build_document(
         identification=identification,
         recording=recording,
@@ -129,6 +164,16 @@ def run_identify(
         config_resolved=config.resolved(),
     )
     return identification, document
+
+
+def _estimate(recording: Recording, config: Config) -> Identification:
+    if config.estimate.effects:
+        from flexid_cli.diagnose.given import identify_with
+
+        return identify_with(recording, config, config.estimate.effects)
+    from flexid_cli.estimate.identify import identify as estimate
+
+    return estimate(recording, config)
 
 
 def _anything_identified(identification: Identification) -> bool:

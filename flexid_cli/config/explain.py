@@ -23,6 +23,7 @@ from flexid_cli.config.schema import (
 from flexid_cli.config.yaml12 import Path, parse_scalar, path_text
 
 if typing.TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
     from pydantic_core import ErrorDetails
 
 _LIMITS = {
@@ -114,10 +115,16 @@ def _model_at(path: Path) -> type[BaseModel] | None:
     """Find the model that describes the section at ``path``."""
     model: type[BaseModel] | None = Config
     for step in path:
-        if model is None or step not in model.model_fields:
+        fields = {} if model is None else _fields(model)
+        if step not in fields:
             return None
-        model = _model_in(model.model_fields[str(step)].annotation)
+        model = _model_in(fields[str(step)].annotation)
     return model
+
+
+def _fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """Fields by the names that a file gives them: some are no names of Python."""
+    return {field.alias or name: field for name, field in model.model_fields.items()}
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
@@ -128,8 +135,8 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
 
 def _all_sections(model: type[BaseModel] = Config, path: Path = ()) -> dict[Path, list[str]]:
     """Keys of every section by its path."""
-    sections = {path: list(model.model_fields)}
-    for name, field in model.model_fields.items():
+    sections = {path: list(_fields(model))}
+    for name, field in _fields(model).items():
         child = _model_in(field.annotation)
         if child is not None:
             sections |= _all_sections(child, (*path, name))
@@ -139,7 +146,7 @@ def _all_sections(model: type[BaseModel] = Config, path: Path = ()) -> dict[Path
 def _explain_unknown(path: Path, data: object) -> Finding:
     section, key = path[:-1], str(path[-1])
     model = _model_at(section)
-    permitted = list(model.model_fields) if model is not None else []
+    permitted = list(_fields(model)) if model is not None else []
     listing = "permitted here: " + ", ".join(permitted)
     head, colon, tail = key.partition(":")
     if colon and head in permitted:
@@ -163,7 +170,7 @@ def _explain_unknown(path: Path, data: object) -> Finding:
 
 def _explain_missing(path: Path) -> Finding:
     model = _model_at(path[:-1])
-    field = model.model_fields.get(str(path[-1])) if model is not None else None
+    field = _fields(model).get(str(path[-1])) if model is not None else None
     hint = ""
     if path == ("version",):
         hint = "add the line `version: 1`"
@@ -171,7 +178,7 @@ def _explain_missing(path: Path) -> Finding:
         hint = f"add {path[-1]}: {field.description}"
     elif field is not None:
         child = _model_at(path)
-        needed = [] if child is None else [k for k, f in child.model_fields.items() if f.is_required()]
+        needed = [] if child is None else [k for k, f in _fields(child).items() if f.is_required()]
         hint = f"add the section {path[-1]} with {', '.join(needed)}"
     return Finding(f"{path[-1]} is missing", path, hint, kind="missing")
 
@@ -285,7 +292,7 @@ def _hint_for_section(path: Path, value: object) -> str:
     if isinstance(value, str) and name == "time":
         return f"write time: {{source: {_quote_if_needed(value)}}}"
     model = _model_at(path)
-    keys = list(model.model_fields) if model is not None else []
+    keys = list(_fields(model)) if model is not None else []
     return f"its keys are {', '.join(keys)}" + (
         "; {} leaves all at their defaults" if name == "pipeline" else ""
     )

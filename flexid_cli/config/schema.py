@@ -42,6 +42,10 @@ def _to_tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
 
 
+def _to_symbols(names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(PER_RECORD.get(name, name) for name in names)
+
+
 def _canonical_unit(text: str) -> str:
     """Replace usual spellings by the unit's own name; what is unknown is left for the rules to report."""
     try:
@@ -256,6 +260,25 @@ class Pipeline(Model):
     )
 
 
+# What a payload, a posture, the temperature or a drive's offset change from one record to the next, by the models'
+# symbols. Motor inertia and stiffness are what the records of one axis share.
+PER_RECORD = {
+    "load_inertia": "JL",
+    "gravity_moment_x": "MX",
+    "gravity_moment_y": "MY",
+    "torque_offset": "offset",
+    "motor_viscous_friction": "FVm",
+    "motor_coulomb_friction": "FSm",
+    "load_viscous_friction": "FV",
+    "load_coulomb_friction": "FS",
+}
+PerRecordName = Literal[
+    "JL", "MX", "MY", "offset", "FVm", "FSm", "FV", "FS",
+    "load_inertia", "gravity_moment_x", "gravity_moment_y", "torque_offset",
+    "motor_viscous_friction", "motor_coulomb_friction", "load_viscous_friction", "load_coulomb_friction",
+]  # fmt: skip
+
+
 class EstimateOptions(Model):
     """How parameters and their intervals are estimated."""
 
@@ -274,6 +297,31 @@ class EstimateOptions(Model):
     )
     covariance: Literal["hac", "iid"] = Field(
         default="hac", description="hac allows for correlated residuals; iid does not."
+    )
+    per_record: (
+        Annotated[
+            tuple[PerRecordName, ...],
+            BeforeValidator(_to_tuple),
+            AfterValidator(_to_symbols),
+            Field(min_length=1),
+        ]
+        | None
+    ) = Field(
+        default=None,
+        description="With several records of one axis: parameters, by symbol or name, that differ between them"
+        " because payload, posture or temperature do. All others are shared.",
+        examples=[["JL", "MX", "MY"]],
+    )
+    essential: bool = Field(
+        default=False,
+        description="Set friction, gravity and offsets that the data cannot tell from zero to zero, by backward"
+        " elimination at the level 1 - confidence_level, and fit the rest again.",
+    )
+    effects: Annotated[tuple[Text, ...], BeforeValidator(_to_tuple)] | None = Field(
+        default=None,
+        alias="with",
+        description="Effects of the library joined to the models by `identify` (`flexid effects` lists them).",
+        examples=[["backlash", "stribeck_motor"]],
     )
 
 
@@ -408,7 +456,7 @@ class Config(Model):
 
     @model_validator(mode="after")
     def _obey_rules(self) -> Config:
-        broken = list(broken_rules(self.model_dump(mode="json", exclude_none=True)))
+        broken = list(broken_rules(self.model_dump(mode="json", exclude_none=True, by_alias=True)))
         if broken:
             raise PydanticCustomError(RULE_ERROR, "{text}", {"text": "; ".join(b.message for b in broken)})
         return self
@@ -421,7 +469,7 @@ class Config(Model):
 
     def resolved(self) -> dict[str, Any]:
         """Everything as plain data, with all defaults filled in; what is chosen automatically is left out."""
-        return self.model_dump(mode="json", exclude_none=True)
+        return self.model_dump(mode="json", exclude_none=True, by_alias=True)
 
 
 def config_schema() -> dict[str, Any]:
@@ -731,6 +779,27 @@ def _rule_models(view: _View) -> Iterator[BrokenRule]:
             )
 
 
+def _rule_per_record(view: _View) -> Iterator[BrokenRule]:
+    names = view.get("estimate", "per_record")
+    if not isinstance(names, list | tuple):
+        return
+    symbols = [PER_RECORD.get(name, name) if isinstance(name, str) else name for name in names]
+    for index, symbol in enumerate(symbols):
+        if symbol in symbols[:index]:
+            yield BrokenRule(
+                f"{symbol} is listed twice", ("estimate", "per_record", index), "remove one of the two"
+            )
+
+
+def _rule_essential(view: _View) -> Iterator[BrokenRule]:
+    if view.get("estimate", "essential") is True and view.get("estimate", "route") == "paper":
+        yield BrokenRule(
+            "route paper reproduces the paper's tables, which leave no parameter out",
+            ("estimate", "essential"),
+            "take one of `essential` and `route: paper` out",
+        )
+
+
 def _rule_csv(view: _View) -> Iterator[BrokenRule]:
     delimiter, encoding = view.get("csv", "delimiter"), view.get("csv", "encoding")
     if delimiter is not None and delimiter == view.get("csv", "decimal"):
@@ -779,6 +848,8 @@ _RULES: tuple[Callable[[_View], Iterator[BrokenRule]], ...] = (
     _rule_distinct_sources,
     _rule_controller,
     _rule_models,
+    _rule_per_record,
+    _rule_essential,
     _rule_csv,
     _rule_simulation,
 )

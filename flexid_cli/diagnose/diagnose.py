@@ -24,9 +24,9 @@ from flexid_cli.diagnose.result import (
     Where,
 )
 from flexid_cli.diagnose.search import Candidate, Form
-from flexid_cli.diagnose.selection import Selection, select, threshold
+from flexid_cli.diagnose.selection import Selection, most_promising, select, threshold
 from flexid_cli.diagnose.simulation import simulation_error
-from flexid_cli.diagnose.start import first_problem, has_joint
+from flexid_cli.diagnose.start import first_problem, first_problems, has_joint
 from flexid_cli.effects.base import EffectValues
 from flexid_cli.effects.registry import effects as library
 from flexid_cli.estimate.result import Estimate
@@ -70,13 +70,13 @@ def diagnose(
         The recording is too short, or shows no flexible axis at all.
     """
     both = has_joint(recording, config)
-    fitter = Fitter(_forms(both, linear=recording.linear), _shifts(config))
-    problem = first_problem(recording, config, fitter)
-    selection = select(fitter, problem)
+    fitter = Fitter(forms_of(both, linear=recording.linear), torque_shifts(config))
+    selection = select(fitter, most_promising(fitter, first_problems(recording, config, fitter)))
     return _Report(fitter, selection, recording, config, validation, known or {}).diagnosis()
 
 
-def _forms(both: bool, *, linear: bool = False) -> list[Form]:
+def forms_of(both: bool, *, linear: bool = False) -> list[Form]:
+    """Forms of all effects that the signals allow: with both encoders or one, on a rotary or a linear axis."""
     return [
         Form(effect, k)
         for effect in library()
@@ -86,7 +86,7 @@ def _forms(both: bool, *, linear: bool = False) -> list[Form]:
     ]
 
 
-def _shifts(config: Config) -> tuple[float, ...]:
+def torque_shifts(config: Config) -> tuple[float, ...]:
     """Periods by which the torque may act later than it is taken to.
 
     Whether a drive's torque is held from its stamp is a convention that few people know of their logs: half a period

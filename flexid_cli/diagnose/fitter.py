@@ -166,12 +166,20 @@ class Fitter:
                 applied=self._errors(fitted),
                 stiffening=fitted.stiffening,
             )
-            fitted = self._shapes(self.fit(moved, fitted.chosen))
+            fitted = self._shapes(self._reversing(self.fit(moved, fitted.chosen)))
             gained = best.loss - fitted.loss
             best = fitted if gained > 0.0 else best
             if abs(gained) < SETTLED:
                 break
         return best
+
+    def _reversing(self, fitted: Fitted) -> Fitted:
+        """Without a joint encoder, the likelier of the two ways to tell when the load reverses."""
+        problem = fitted.problem
+        if problem.both or problem.rigid:
+            return fitted
+        other = self.fit(problem.at(problem.base, led=not problem.led), fitted.chosen)
+        return min(fitted, other, key=lambda f: f.loss)
 
     @staticmethod
     def _errors(fitted: Fitted) -> dict[Form, Array]:

@@ -14,6 +14,7 @@ from flexid_cli.diagnose.rows import Complex, Taper, Weights, motor_only_noise, 
 from flexid_cli.effects.motion import Base, Motion, Terms
 from flexid_cli.effects.signature import Scale
 from flexid_cli.estimate.budget import NoiseLevels
+from flexid_cli.estimate.driven import follow
 from flexid_cli.pipeline import filters
 from flexid_cli.pipeline.columns import reversal
 from flexid_cli.pipeline.derivatives import differentiate
@@ -140,6 +141,9 @@ class Problem:
         The motor's encoder alone, and an axis that is taken for rigid: what ``base`` says of the load stays.
     stiffening : float
         Stiffness of the effects that the linearisation holds, beside that of ``base``.
+    led : bool
+        Without a joint encoder, whether the load's reversals are those of a simulation that the measured motor leads,
+        or of the position that the torque shows: the one lacks effects, the other is blurred by noise.
     """
 
     def __init__(
@@ -159,6 +163,7 @@ class Problem:
         settled: bool = True,
         stiffening: float = 0.0,
         rigid: bool = False,
+        led: bool = False,
     ) -> None:
         self.stretches, self.noise, self.band_hz = stretches, noise, band_hz
         self.base = replace(base, gear_ratio=gear_ratio)
@@ -167,7 +172,7 @@ class Problem:
         self.settled, self.stiffening = settled, stiffening
         self.applied: Mapping[Form, Array] = applied or {}
         self.recorded = stretches
-        self.rigid = rigid
+        self.rigid, self.led = rigid, led
         self.names = BOTH_NAMES if both else RIGID_NAMES if rigid else ALONE_NAMES
         self.torque_rms = float(np.sqrt(np.mean(np.concatenate([s.torque for s in stretches]) ** 2)))
         self.weights = [Weights(s.taper, self.spectral(s)) for s in stretches]
@@ -182,6 +187,7 @@ class Problem:
         shift: float | None = None,
         applied: Mapping[Form, Array] | None = None,
         stiffening: float | None = None,
+        led: bool | None = None,
     ) -> Problem:
         """The same record linearised elsewhere, with other errors of the joint's position taken out."""
         stretches = self.stretches
@@ -202,6 +208,7 @@ class Problem:
             settled=self.settled,
             stiffening=self.stiffening if stiffening is None else stiffening,
             rigid=self.rigid,
+            led=self.led if led is None else led,
         )
         other.recorded = self.recorded
         return other
@@ -263,7 +270,7 @@ class Problem:
             inertial = base.Jm * s.derivative(s.motor_smooth, 2)
             joint = s.motor_smooth - (s.lowpass(s.torque, SMOOTH_BAND) - inertial - friction) / base.K
             joint = s.lowpass(joint, SMOOTH_BAND)
-            sharp = s.derivative(joint, 1)
+            sharp = s.derivative(self._led(s) if self.led else joint, 1)
         velocity = s.derivative(joint, 1)
         return Motion(
             time_s=s.time_s,
@@ -284,6 +291,11 @@ class Problem:
             joint_encoder=self.both,
             duration_s=self.duration_s,
         )
+
+    def _led(self, s: Stretch) -> Array:
+        """Where the load goes when the motor moves as measured: no noise of the torque is in it, and no effect."""
+        b = self.base
+        return follow(b.K * s.motor, b.JL, max(b.FV, 0.0), b.K, max(b.FS, 0.0), b.load_reversal, s.period_s)
 
     def _rows(self, part: Part) -> Array:
         """Rows of all stretches, equation by equation, shape (equations * rows, k)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +59,23 @@ def select(fitter: Fitter, problem: Problem) -> Selection:
         found = fitter.candidates(fitted)
     alternatives, rivals = _alternatives(fitter, fitted)
     return Selection(before, fitted, alternatives, tuple(tested), rivals)
+
+
+def most_promising(fitter: Fitter, problems: Sequence[Problem]) -> Problem:
+    """Of several linearisations the one that is most likely with the one effect that explains most there.
+
+    What the baseline lacks draws its stiffness to where it stands in for it: without an effect the likelihood says
+    little about where to begin.
+    """
+    if len(problems) == 1:
+        return problems[0]
+
+    def loss(problem: Problem) -> float:
+        fitted = fitter.relax(problem, rounds=1)
+        best = _added(fitter, fitted, fitter.candidates(fitted))
+        return fitted.loss if best is None else min(best.loss, fitted.loss)
+
+    return min(problems, key=loss)
 
 
 def threshold(problem: Problem) -> float:

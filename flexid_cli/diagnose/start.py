@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 HIGHEST_BAND = 0.2  # of the sampling rate
 FIRST_WIDTH = 0.004  # of the highest speed
 SCAN_POINTS, SCAN_STEPS = 14, 4
+SAME_MINIMUM = 0.25  # of the stiffness's logarithm
+MOST_STARTS = 6
 RIGID = 100.0  # times the band: a resonance that is nowhere in it
 SCANNED_WITH = ("torque_offset", "gravity", "joint_damping", "load_dependent_friction", "viscous_nonlinear")
 # Where the torque's noise is looked for: times the band, least lines, and how far it is taken to rise below.
@@ -42,7 +44,16 @@ def has_joint(recording: Recording, config: Config) -> bool:
 def first_problem(
     recording: Recording, config: Config, fitter: Fitter, highest_hz: float = np.inf
 ) -> Problem:
+    """The most likely of `first_problems`."""
+    return first_problems(recording, config, fitter, highest_hz)[0]
+
+
+def first_problems(
+    recording: Recording, config: Config, fitter: Fitter, highest_hz: float = np.inf
+) -> list[Problem]:
     """The record in its band, up to ``highest_hz`` at most, linearised where a simple fit puts it.
+
+    There are several, the most likely one first, where the motor's encoder alone shows no resonance for sure.
 
     Raises
     ------
@@ -86,11 +97,13 @@ def first_problem(
         shift=fitter.shifts[0],
         rigid=rigid,
     )
-    if not both and not rigid:
-        known = _identified(recording, config, width)
-        problem = _scanned(problem, fitter) if known is None else problem.at(known)
-        problem.anchor, problem.settled = problem.base, known is not None
-    return _with_torque_noise(fitter.relax(problem, rounds=1).problem if both or rigid else problem)
+    if both or rigid:
+        return [_with_torque_noise(fitter.relax(problem, rounds=1).problem)]
+    known = _identified(recording, config, width)
+    problems = _scanned(problem, fitter) if known is None else [problem.at(known)]
+    for one in problems:
+        one.anchor, one.settled = one.base, known is not None
+    return [_with_torque_noise(one) for one in problems]
 
 
 def _both_base(stretches: list[Stretch], width: float) -> Base:
@@ -193,8 +206,8 @@ def _identified(recording: Recording, config: Config, width: float) -> Base | No
     )
 
 
-def _scanned(problem: Problem, fitter: Fitter) -> Problem:
-    """The most likely of a series of locked-motor frequencies, each followed for a few Gauss-Newton steps.
+def _scanned(problem: Problem, fitter: Fitter) -> list[Problem]:
+    """The minima that a series of locked-motor frequencies leads to, by a few Gauss-Newton steps each.
 
     Effects that are linear in their amplitudes are in the fit, so that what the baseline lacks does not draw its
     stiffness away. A rigid axis is one of the series.
@@ -213,7 +226,11 @@ def _scanned(problem: Problem, fitter: Fitter) -> Problem:
         for _ in range(SCAN_STEPS):
             trial = trial.at(fitter.moved(fitter.fit(trial, free)))
         trials.append((fitter.fit(trial, free).loss, trial))
-    return min(trials, key=lambda t: t[0])[1]
+    minima: list[Problem] = []
+    for _, trial in sorted(trials, key=lambda t: t[0]):
+        if all(abs(np.log(trial.base.K / other.base.K)) > SAME_MINIMUM for other in minima):
+            minima.append(trial)
+    return minima[:MOST_STARTS]
 
 
 def _with_torque_noise(problem: Problem) -> Problem:

@@ -158,7 +158,7 @@ def usable_band(recording: Recording, *, joint: bool) -> float:
         positions.append(segment.joint_position)
     edges = []
     for position in positions:
-        length = int(min(position.size, max(256, 8 * rate)))
+        length = int(min(position.size - 2, max(256, 8 * rate)))
         frequency, density = welch(np.diff(position, 2), fs=rate, nperseg=length)
         shaped = density / np.maximum((2.0 * np.sin(np.pi * frequency / rate)) ** 4, 1e-30)
         floor = np.median(shaped[frequency > 0.3 * rate])

@@ -26,6 +26,7 @@ NOISE_BAND = (0.6, 0.95)
 NOISE_SEED = 20010521
 SIGN_BAND_STEP = 0.7
 MAX_NOISE_SHARE = 0.9
+_JOINT_SIGNALS = frozenset({"joint", "gravity_cos", "gravity_sin", "sign_joint"})
 _NOISY_SIGNALS = frozenset({"torque", "motor", "joint", "torsion"})
 
 
@@ -80,7 +81,7 @@ def _floor(x: Array) -> float:
     """Standard deviation of white noise with the median density of the upper band."""
     from scipy.signal import welch
 
-    length = min(1024, x.size)
+    length = min(1024, x.size - 2)
     # The second difference flattens the steep spectrum of a motion, whose leakage would hide the floor.
     frequency, density = welch(np.diff(x, 2), fs=1.0, nperseg=length, window="hann")
     gain = (2.0 * np.sin(np.pi * frequency)) ** 4
@@ -171,6 +172,36 @@ def torque_delay(model: Model, result: FitResult, columns: Columns, lengths: Seq
                 gradient -= coefficient * columns("torque", order + 1)
         gradients.append(gradient)
     return _nuisance(result, gradients, lengths)
+
+
+def encoder_skew(model: Model, result: FitResult, columns: Columns) -> Nuisance:
+    """Age of the joint position at its stamp beside the motor position's, s; both encoders only.
+
+    A joint position that is a old is q(t) = q_stamped(t + a): its columns lack a q', the torsion has a q' too much.
+    The part a q' = a (qm' - d') that follows qm' is what friction of motor and load takes up; what tells the age from
+    them is a torque that follows the torsion's velocity d' and acts the same way in both equations, unlike that of a
+    damping in the joint (`joint_damping`), which acts on motor and load in opposite ways.
+    """
+    gradients = []
+    for block, a in zip(model.blocks, model.coefficients(result.theta), strict=True):
+        gradient = np.zeros(sum(columns.lengths))
+        for (signal, order), coefficient in zip(block.columns, a, strict=True):
+            if signal in _JOINT_SIGNALS:
+                gradient += coefficient * columns(signal, order + 1)
+            elif signal == "torsion":
+                gradient -= coefficient * columns("joint", order + 1)
+        gradients.append(gradient)
+    return _nuisance(result, gradients, columns.lengths)
+
+
+def joint_damping(model: Model, result: FitResult, columns: Columns) -> Nuisance:
+    """Damping parallel to the joint's spring; both encoders only. It adds D d' wherever K d stands."""
+    K = result.theta[[p.symbol for p in model.parameters].index("K")]
+    gradients = []
+    for block, a in zip(model.blocks, model.coefficients(result.theta), strict=True):
+        k = [signal for signal, _ in block.columns].index("torsion")
+        gradients.append(a[k] / K * columns("torsion", 1))
+    return _nuisance(result, gradients, columns.lengths)
 
 
 def torque_hold(model: Model, result: FitResult, columns: Columns) -> Array:

@@ -58,7 +58,7 @@ def identify(recording: Recording, config: Config) -> Identification:
     DataError
         No model can be solved on this recording.
     """
-    ids = _model_ids(recording, config)
+    ids = model_ids(recording, config)
     flexible = [i for i in ids if i != "rigid"]
     f1 = None
     if flexible and config.axis.f1_hz is None:
@@ -80,7 +80,14 @@ def identify(recording: Recording, config: Config) -> Identification:
     return Identification(tuple(models), tuple(skipped), tuple(recording.notes))
 
 
-def _model_ids(recording: Recording, config: Config) -> tuple[str, ...]:
+def model_ids(recording: Recording, config: Config) -> tuple[str, ...]:
+    """Models that the configuration asks for, or all that the signals allow.
+
+    Raises
+    ------
+    DataError
+        One needs a joint encoder that the configuration does not name.
+    """
     ids = config.models or (("two_encoders",) if recording.has_joint_position else ()) + ("motor_only",)
     if "two_encoders" in ids and not recording.has_joint_position:
         raise DataError(
@@ -94,6 +101,25 @@ def _solve(recording: Recording, config: Config, model_id: str, f1: float | None
     if config.estimate.route == "paper" and model_id != "rigid":
         tuning = band.choose_tuning(recording, config, model_id, f1)
         return paper_route.solve_paper(make_columns(recording, config, tuning), config, model_id, tuning)
+    solution = solve_direct(recording, config, model_id, f1)
+    if config.estimate.essential:
+        solution = summary.reduced(solution, config)
+    return summary.summarise(solution, config)
+
+
+def solve_direct(recording: Recording, config: Config, model_id: str, f1: float | None) -> Solution:
+    """Fit one model by the configured method, tuned to the resonance that the fit itself finds.
+
+    Parameters
+    ----------
+    f1 : float or None
+        Resonance that the data show, Hz, where the configuration names none.
+
+    Raises
+    ------
+    DataError
+        It cannot be solved on this recording.
+    """
     solver = {"two_encoders": _two_encoders, "motor_only": _motor_only, "rigid": _rigid}[model_id]
     solution = solver(recording, config, f1)
     fitted = summary.fitted_resonance(solution.model, solution.result.theta)
@@ -101,7 +127,7 @@ def _solve(recording: Recording, config: Config, model_id: str, f1: float | None
     if solution.tuning.f1_source == "data" and fitted and off > RETUNE_TOLERANCE:
         # The scan's resonance came from a simpler fit; tune once more to the one that the full fit finds.
         solution = solver(recording, config, fitted)
-    return summary.summarise(solution, config)
+    return solution
 
 
 def make_columns(recording: Recording, config: Config, tuning: band.Tuning) -> Columns:
@@ -164,7 +190,7 @@ def _regress(M: Array) -> Array:
 
 
 def _motor_only(recording: Recording, config: Config, f1: float | None) -> Solution:
-    recording = _without_joint(recording)
+    recording = without_joint(recording)
     tuning = band.choose_tuning(recording, config, "motor_only", f1)
     columns = make_columns(recording, config, tuning)
     model = MotorOnly(gravity_form(recording))
@@ -203,7 +229,9 @@ def _motor_fit(
 def _log_residual(columns: Columns, names: Sequence[tuple[str, int]]) -> float:
     """Logarithm of the residual's size when the first column is regressed on the others."""
     W = np.column_stack([columns(*c) for c in names])
-    R = triangle(W / np.linalg.norm(W, axis=0))
+    size = np.linalg.norm(W, axis=0)
+    size[size == 0.0] = 1.0
+    R = triangle(W / size)
     rest = R[:, 0] - R[:, 1:] @ np.linalg.lstsq(R[:, 1:], R[:, 0], rcond=None)[0]
     return float(np.log(max(float(np.linalg.norm(rest)), 1e-300)))
 
@@ -225,7 +253,7 @@ def _motor_start(columns: Columns, model: MotorOnly) -> Array:
 
 
 def _rigid(recording: Recording, config: Config, f1: float | None) -> Solution:
-    recording = _without_joint(recording)
+    recording = without_joint(recording)
     tuning = band.choose_tuning(recording, config, "rigid", f1)
     fixed = config.pipeline.band_hz is not None or config.pipeline.decimation is not None
     levels = budget.noise_levels(recording)
@@ -253,7 +281,7 @@ def _rigid(recording: Recording, config: Config, f1: float | None) -> Solution:
     return Solution(model, columns, matrices, result, tuning, "ols", "one equation, linear in its parameters")
 
 
-def _without_joint(recording: Recording) -> Recording:
+def without_joint(recording: Recording) -> Recording:
     """The recording as a drive without joint encoder would have it."""
     segments = tuple(replace(segment, joint_position=None) for segment in recording.segments)
     return replace(recording, segments=segments)

@@ -61,7 +61,7 @@ def _floor(x: Array) -> tuple[float, float]:
     """Standard deviation a sample of white noise with the median density, and the doubt about its square."""
     from scipy.signal import welch
 
-    length = min(1024, x.size)
+    length = min(1024, x.size - 2)
     # The second difference flattens the steep spectrum of a motion, whose leakage would hide the floor.
     frequency, density = welch(np.diff(x, 2), fs=1.0, nperseg=length, window="hann")
     gain = (2.0 * np.sin(np.pi * frequency)) ** 4

@@ -152,6 +152,10 @@ def _jacobian(
     parts: list[list[Array]] = [[] for _ in residuals]
     for k in range(theta.size):
         step = max(0.1 * float(stderr[k]), STEP * abs(float(theta[k])))
+        if step == 0.0:  # held at zero
+            for part, old in zip(parts, residuals, strict=True):
+                part.append(np.zeros_like(old))
+            continue
         moved = theta.copy()
         moved[k] += step
         changed = _residuals(model, columns, moved)

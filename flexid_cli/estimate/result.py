@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -40,6 +40,8 @@ class Estimate:
         Whether the estimate can be relied on.
     reason : str
         Why, where the verdict is not ``identified``.
+    advice : str
+        What to record to determine it, where the verdict is not ``identified`` and a recording would help.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Estimate:
     relative_stderr_percent: float | None
     verdict: Verdict
     reason: str = ""
+    advice: str = ""
 
 
 @dataclass(frozen=True)
@@ -142,6 +145,54 @@ class PipelineSummary:
 
 
 @dataclass(frozen=True)
+class ModelEffect:
+    """An effect that was named and joined to a model.
+
+    Attributes
+    ----------
+    name, code, family : str
+    parameters : tuple of Estimate
+    statistic, threshold, p_value, held_out_gain, stability : float
+        Evidence for it as a diagnosis has it; NaN where it could not join the model.
+    """
+
+    name: str
+    code: str
+    family: str
+    parameters: tuple[Estimate, ...]
+    statistic: float
+    threshold: float
+    p_value: float
+    held_out_gain: float
+    stability: float
+
+
+@dataclass(frozen=True)
+class RecordResult:
+    """One of several records of the axis, as it speaks for itself.
+
+    Attributes
+    ----------
+    name : str
+        Of the record.
+    parameters : tuple of Estimate
+        From this record alone; empty where it could not be solved.
+    fit : Fit or None
+        Of these estimates.
+    tests : mapping
+        As `ModelResult`.
+    reason : str
+        Why it does not count in the joint estimate, or empty.
+    """
+
+    name: str
+    parameters: tuple[Estimate, ...] = ()
+    fit: Fit | None = None
+    tests: dict[str, dict[str, Any]] = field(default_factory=dict)
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class ModelResult:
     """One model solved on one recording.
 
@@ -167,6 +218,10 @@ class ModelResult:
         Effects that were added beyond the declared baseline (``gravity``, ``torque_offset``).
     tests : mapping
         Named test results, each a mapping of plain numbers and words (statistic, p_value, verdict).
+    effects, parameters_before : tuple of ModelEffect, tuple of Estimate
+        Effects that the user named, and the physical parameters without them; empty where none were.
+    records : tuple of RecordResult
+        The records of a joint estimate, each alone; empty where there is one recording.
     """
 
     id: str
@@ -188,6 +243,9 @@ class ModelResult:
     added_terms: tuple[str, ...]
     tests: dict[str, dict[str, Any]]
     warnings: tuple[str, ...]
+    effects: tuple[ModelEffect, ...] = ()
+    parameters_before: tuple[Estimate, ...] = ()
+    records: tuple[RecordResult, ...] = ()
 
 
 @dataclass(frozen=True)

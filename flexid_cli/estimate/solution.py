@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,9 @@ from flexid_cli.estimate.band import Tuning
 from flexid_cli.estimate.fit import FitResult
 from flexid_cli.models.base import Model
 from flexid_cli.pipeline.columns import Columns
+
+if TYPE_CHECKING:
+    from flexid_cli.estimate.essential import Reduction
 
 Array = NDArray[np.float64]
 
@@ -55,6 +59,8 @@ class Solution:
         The output-error fit, where it is the one to report; ``result`` is then what it started from.
     notes : tuple of str
         What a person should know of the estimator: a fallback and its reason.
+    reduction : Reduction or None
+        Which parameters were tested and set to zero; None where all were fitted without a test.
     """
 
     model: Model
@@ -68,6 +74,7 @@ class Solution:
     instruments: tuple[Array, ...] | None = None
     outputs: FitResult | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
+    reduction: Reduction | None = None
 
     @property
     def reported(self) -> FitResult:

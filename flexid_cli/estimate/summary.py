@@ -10,16 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.errors import DataError
-from flexid_cli.estimate import budget, checks, overdetermination
-from flexid_cli.estimate.result import Estimate, Fit, ModelResult, PipelineSummary, Spectrum, Trace
+from flexid_cli.estimate import bootstrap, budget, checks, identifiability, overdetermination, timing
+from flexid_cli.estimate.essential import reduce_solution
+from flexid_cli.estimate.pipeline_summary import pipeline_summary
+from flexid_cli.estimate.result import Estimate, Fit, ModelResult, Spectrum, Trace
 from flexid_cli.estimate.solution import Solution
 from flexid_cli.estimate.verdict import correlated_with, demoted, judge, model_doubt, undetermined
 from flexid_cli.models.base import Model, Parameter, unit_of
-from flexid_cli.pipeline.tuning import DECIMATION_EDGE
 
 if TYPE_CHECKING:
     from flexid_cli.config.schema import Config
-    from flexid_cli.pipeline.columns import Columns
+    from flexid_cli.signals.recording import Recording
 
 Array = NDArray[np.float64]
 
@@ -35,9 +36,6 @@ SUMS = (
     (Parameter("viscous_friction", "FVm + FV", "viscous"), ("FVm", "FV")),
     (Parameter("coulomb_friction", "FSm + FS", "torque"), ("FSm", "FS")),
 )
-SIGNIFICANT_DELAY_SAMPLES = 0.1
-SIGNIFICANT_SIGMA = 3.0
-HALF_SAMPLE_TOLERANCE = 0.2
 CLEAR_GEAR_SIGMA = 5.0
 # A ratio of tooth numbers is off by one tooth or not at all: by a thousandth for a ratio of a thousand.
 SMALLEST_GEAR_ERROR = 1e-3
@@ -62,10 +60,14 @@ class Uncertainty:
         The largest systematic source of each parameter where it exceeds the random part, else empty.
     delay : budget.Nuisance
         Torque delay as the residuals show it.
+    skew : budget.Nuisance or None
+        Age of the joint position beside the motor's, where both are measured.
     gear : budget.Nuisance or None
         Relative error of the gear ratio, where both encoders show one clearly.
     shifts : mapping of str to ndarray, shape (p,)
         Standard error that each systematic source adds.
+    random : ndarray, shape (p, p)
+        Covariance of the random part.
     """
 
     covariance: Array
@@ -73,11 +75,20 @@ class Uncertainty:
     largest: tuple[str, ...]
     delay: budget.Nuisance
     gear: budget.Nuisance | None = None
+    skew: budget.Nuisance | None = None
     shifts: Mapping[str, Array] = field(default_factory=dict)
+    random: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 def summarise(solution: Solution, config: Config, *, regression: bool = True) -> ModelResult:
     """Parameters with intervals and verdicts, derived quantities, fit, tests and figures' data."""
+    return analyse(solution, config, regression=regression)[0]
+
+
+def analyse(
+    solution: Solution, config: Config, *, regression: bool = True
+) -> tuple[ModelResult, Uncertainty]:
+    """The result, and what its standard errors are made of, in the model's own parameters."""
     free: tuple[Estimate, ...] = ()
     tests: dict[str, dict[str, Any]] = {}
     misfit = 1.0
@@ -85,37 +96,48 @@ def summarise(solution: Solution, config: Config, *, regression: bool = True) ->
         free, tests["over_determination"] = _free_regression(solution, config)
         misfit = _misfit(tests["over_determination"])
     uncertainty = total_uncertainty(solution, config, misfit)
-    parameters, theta, covariance = _reported(solution.model, solution.reported.theta, uncertainty.covariance)
+    parameters, theta, covariance = reported_parameters(
+        solution.model, solution.reported.theta, uncertainty.covariance
+    )
     estimates = _estimates(solution, config, uncertainty, parameters, theta, covariance)
     fitted = _fit(solution)
     doubt = model_doubt(estimates, fitted.fit_percent)
-    tests["torque_delay"] = _delay_test(uncertainty.delay, solution)
+    tests["torque_delay"] = timing.timing_test(uncertainty.delay, solution, timing.DELAY_MEANING)
+    if uncertainty.skew is not None:
+        tests["encoder_skew"] = timing.timing_test(uncertainty.skew, solution, timing.SKEW_MEANING)
     if regression:
         tests |= checks.solution_tests(solution)
+        tests["bootstrap"] = bootstrap.interval_check(solution)
+        tests["identifiability"] = identifiability.before_the_solve(solution)
         tests |= _profile(solution, config, uncertainty)
         tests["bias_budget"] = _bias_budget(solution, uncertainty, parameters)
+    if solution.reduction is not None:
+        tests["essential"] = solution.reduction.test()
     effects = dict.fromkeys(p.effect for p in parameters if p.effect)
-    return ModelResult(
+    found = ModelResult(
         id=solution.model.id,
         method=solution.method,
         method_reason=solution.method_reason,
         equation=solution.model.equation,
-        parameters=tuple(demoted(e, doubt) for e in estimates),
+        parameters=identifiability.with_advice([demoted(e, doubt) for e in estimates], solution, doubt),
         regression=tuple(demoted(e, doubt) for e in free),
-        derived=tuple(demoted(e, doubt) for e in _derived(solution, config, uncertainty)),
+        derived=identifiability.with_advice(
+            [demoted(e, doubt) for e in _derived(solution, config, uncertainty)], solution, doubt
+        ),
         correlation_names=tuple(p.symbol for p in parameters),
-        correlation=_correlation(covariance),
+        correlation=correlation_of(covariance),
         condition_number=solution.result.condition_number,
         rank=solution.result.rank,
-        columns=solution.result.theta.size,
+        columns=solution.result.theta.size - len(_set_to_zero(solution)),
         fit=fitted,
         pipeline=pipeline_summary(solution),
         trace=_trace(solution),
-        spectrum=_spectrum(solution.columns),
+        spectrum=torque_spectrum(solution.columns.recording),
         added_terms=tuple(effects),
         tests=tests,
         warnings=_warnings(solution, uncertainty, config, doubt),
     )
+    return found, uncertainty
 
 
 def _misfit(test: Mapping[str, Any]) -> float:
@@ -136,6 +158,22 @@ def _free_regression(solution: Solution, config: Config) -> tuple[tuple[Estimate
         return (), {"statistic": None, "p_value": None, "reason": error.message}
 
 
+def reduced(solution: Solution, config: Config) -> Solution:
+    """The solution with what the data cannot tell from zero set to zero (`essential`)."""
+    misfit = 1.0
+    if solution.model.id == "motor_only":
+        misfit = _misfit(_free_regression(solution, config)[1])
+    shifts = total_uncertainty(solution, config, misfit).shifts
+    return reduce_solution(
+        solution,
+        misfit * solution.reported.covariance,
+        shifts,
+        level=round(1.0 - config.estimate.confidence_level, 12),
+        misfit=misfit,
+        covariance=config.estimate.covariance,
+    )
+
+
 def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -> Uncertainty:
     """Random and systematic part of the estimates' uncertainty.
 
@@ -145,7 +183,10 @@ def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -
     model, result, columns = solution.model, solution.result, solution.columns
     lengths = columns.lengths
     delay = budget.torque_delay(model, result, columns, lengths)
+    skew = budget.encoder_skew(model, result, columns) if model.id == "two_encoders" else None
     shifts: dict[str, Array] = {}
+    if solution.reduction is not None:
+        shifts |= solution.reduction.shifts
     if config.estimate.covariance == "hac":
         if solution.correction is not None:
             shifts["doubt about the noise in the columns"] = solution.correction.doubt
@@ -163,6 +204,9 @@ def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -
             shifts["the torque between its samples"] = held
         if torque.hold is None and torque.delay_s is None:
             shifts["the torque's timing"] = delay.shift(at_most=0.5 / columns.recording.sample_rate_hz)
+        joint = config.signals.joint_position
+        if skew is not None and joint is not None and joint.delay_s is None:
+            shifts["the encoders' timing"] = skew.shift(at_most=0.5 / columns.recording.sample_rate_hz)
         width = budget.reversal_width(model, result, columns, lengths)
         if width is not None:
             shifts["the width of the friction reversal"] = width.shift(at_most=1.0)
@@ -177,14 +221,14 @@ def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -
     random_part = misfit * solution.reported.covariance
     covariance = random_part + sum(np.outer(s, s) for s in shifts.values())
     random = np.maximum(np.diag(random_part), np.finfo(float).tiny)
-    share = np.diag(covariance) / random
+    share = np.minimum(np.diag(covariance) / random, 1e6)
     dof = np.minimum(solution.reported.degrees_of_freedom * share**2, 1e6)
     largest = []
     for k in range(result.theta.size):
         sizes = {name: abs(float(shift[k])) for name, shift in shifts.items()}
         name = max(sizes, key=sizes.__getitem__, default="")
         largest.append(name if name and shifts[name][k] ** 2 > random[k] else "")
-    return Uncertainty(covariance, dof, tuple(largest), delay, gear, shifts)
+    return Uncertainty(covariance, dof, tuple(largest), delay, gear, skew, shifts, random_part)
 
 
 def _clear_gear_error(solution: Solution) -> budget.Nuisance | None:
@@ -196,18 +240,29 @@ def _clear_gear_error(solution: Solution) -> budget.Nuisance | None:
     return gear if clear and abs(gear.value) > SMALLEST_GEAR_ERROR else None
 
 
-def _reported(model: Model, theta: Array, covariance: Array) -> tuple[tuple[Parameter, ...], Array, Array]:
-    """Parameters as the report names them: the spring's torque c at zero torsion becomes the zero z = c / K."""
+def reported_parameters(
+    model: Model, theta: Array, covariance: Array
+) -> tuple[tuple[Parameter, ...], Array, Array]:
+    """Parameters as the report names them, their values and covariance."""
+    parameters, reported, G = report_form(model, theta)
+    return parameters, reported, G @ covariance @ G.T
+
+
+def report_form(model: Model, theta: Array) -> tuple[tuple[Parameter, ...], Array, Array]:
+    """Parameters as the report names them, values, and derivatives with respect to the model's own, shape (p, p).
+
+    The spring's torque c at zero torsion becomes the zero z = c / K.
+    """
     symbols = [p.symbol for p in model.parameters]
-    if "c" not in symbols:
-        return model.parameters, theta, covariance
-    c, k = symbols.index("c"), symbols.index("K")
     G = np.eye(theta.size)
+    if "c" not in symbols:
+        return model.parameters, theta, G
+    c, k = symbols.index("c"), symbols.index("K")
     G[c, c], G[c, k] = 1.0 / theta[k], -theta[c] / theta[k] ** 2
     reported = theta.copy()
     reported[c] = theta[c] / theta[k]
     parameters = tuple(TORSION_ZERO if p.symbol == "c" else p for p in model.parameters)
-    return parameters, reported, G @ covariance @ G.T
+    return parameters, reported, G
 
 
 def _estimates(
@@ -218,16 +273,18 @@ def _estimates(
     theta: Array,
     covariance: Array,
 ) -> tuple[Estimate, ...]:
-    correlation = _correlation(covariance)
+    correlation = correlation_of(covariance)
     symbols = tuple(p.symbol for p in parameters)
     estimates = []
     for k, parameter in enumerate(parameters):
         if k in solution.result.dependent:
-            others = ", ".join(symbols[j] for j in solution.result.dependent if j != k)
-            reason = f"its column depends on those of {others}" if others else "its column is zero"
-            estimates.append(undetermined(parameter, _unit(solution, parameter), reason))
+            estimates.append(_without_estimate(solution, parameters, theta, covariance, k))
             continue
-        doubts = [correlated_with(correlation, symbols, k)]
+        apart = (*solution.result.dependent, *identifiability.others_of(symbols, k))
+        sum_ = identifiability.determined(theta, covariance, k, apart)
+        unit = _unit(solution, parameter)
+        in_words = identifiability.in_words(sum_, symbols, theta, covariance, unit)
+        doubts = [correlated_with(correlation, symbols, k), in_words]
         if uncertainty.largest[k]:
             doubts.append(f"limited by {uncertainty.largest[k]}")
         estimates.append(
@@ -242,6 +299,24 @@ def _estimates(
             )
         )
     return tuple(estimates)
+
+
+def _without_estimate(
+    solution: Solution, parameters: tuple[Parameter, ...], theta: Array, covariance: Array, k: int
+) -> Estimate:
+    """A parameter that was set to zero, or whose column depends on others."""
+    parameter, unit = parameters[k], _unit(solution, parameters[k])
+    fixed = _set_to_zero(solution)
+    if solution.reduction is not None and k in fixed:
+        return undetermined(parameter, unit, solution.reduction.reason(k))
+    symbols = [p.symbol for p in parameters]
+    others = ", ".join(symbols[j] for j in solution.result.dependent if j not in {k, *fixed})
+    if not others or not np.any(solution.result.jacobian[:, k]):
+        return undetermined(parameter, unit, "its column is zero")
+    sum_ = identifiability.exact(solution.result.jacobian, k)
+    in_words = identifiability.in_words(sum_, symbols, theta, covariance, unit)
+    reason = f"its column depends on those of {others}" + (f": {in_words}" if in_words else "")
+    return undetermined(parameter, unit, reason)
 
 
 def _judge(
@@ -292,17 +367,23 @@ def _derived(solution: Solution, config: Config, uncertainty: Uncertainty) -> tu
     theta = solution.reported.theta
     values = dict(zip(symbols, (float(x) for x in theta), strict=True))
     found = []
-    for parameter, value, slopes in (*_resonances(values), *_sums(solution.model, values)):
-        index = [symbols.index(s) for s in slopes]
-        if not set(index) & set(solution.result.dependent):
-            g = np.array(list(slopes.values()))
+    zero = {symbols[k] for k in _set_to_zero(solution)}
+    for parameter, value, slopes in (*resonances(values), *sums(solution.model, values)):
+        left = {s: x for s, x in slopes.items() if s not in zero}
+        index = [symbols.index(s) for s in left]
+        if index and not set(index) & set(solution.result.dependent):
+            g = np.array(list(left.values()))
             stderr = float(np.sqrt(g @ uncertainty.covariance[np.ix_(index, index)] @ g))
             dof = float(np.min(uncertainty.degrees_of_freedom[index]))
             found.append(_judge(solution, config, parameter, value, stderr, dof))
     return tuple(found)
 
 
-def _resonances(v: Mapping[str, float]) -> Iterator[tuple[Parameter, float, Mapping[str, float]]]:
+def _set_to_zero(solution: Solution) -> tuple[int, ...]:
+    return () if solution.reduction is None else solution.reduction.fixed
+
+
+def resonances(v: Mapping[str, float]) -> Iterator[tuple[Parameter, float, Mapping[str, float]]]:
     """Resonance, antiresonance and inertia ratio: parameter, value and its derivatives by symbol."""
     Jm, K, JL = v["Jm"], v["K"], v["JL"]
     for parameter, square, slopes in (
@@ -315,7 +396,7 @@ def _resonances(v: Mapping[str, float]) -> Iterator[tuple[Parameter, float, Mapp
     yield DERIVED[2], JL / Jm, {"Jm": -JL / Jm**2, "K": 0.0, "JL": 1.0 / Jm}
 
 
-def _sums(model: Model, v: Mapping[str, float]) -> Iterator[tuple[Parameter, float, Mapping[str, float]]]:
+def sums(model: Model, v: Mapping[str, float]) -> Iterator[tuple[Parameter, float, Mapping[str, float]]]:
     """Friction of motor and load together, where a model hardly tells one from the other."""
     split = {p.symbol for p in model.parameters if p.split}
     for parameter, (motor, load) in SUMS:
@@ -323,7 +404,8 @@ def _sums(model: Model, v: Mapping[str, float]) -> Iterator[tuple[Parameter, flo
             yield parameter, v[motor] + v[load], {motor: 1.0, load: 1.0}
 
 
-def _correlation(covariance: Array) -> Array:
+def correlation_of(covariance: Array) -> Array:
+    """Correlation matrix; NaN where a parameter has no variance."""
     size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     size[size == 0.0] = np.nan
     return np.asarray(covariance / np.outer(size, size), dtype=np.float64)
@@ -347,80 +429,14 @@ def _trace(solution: Solution) -> Trace:
     return Trace(solution.columns.times, torque, predicted, solution.columns.recording.torque_unit)
 
 
-def _spectrum(columns: Columns) -> Spectrum:
+def torque_spectrum(recording: Recording) -> Spectrum:
+    """Spectrum of the unfiltered torque of the longest segment."""
     from scipy.signal import welch
 
-    recording = columns.recording
     segment = max(recording.segments, key=lambda s: s.samples)
     length = int(min(segment.samples, max(256, SPECTRUM_SEGMENT_S * recording.sample_rate_hz)))
     frequency, density = welch(segment.torque, fs=recording.sample_rate_hz, nperseg=length)
     return Spectrum(frequency[1:], np.sqrt(density[1:]), f"{recording.torque_unit}/sqrt(Hz)")
-
-
-def pipeline_summary(solution: Solution) -> PipelineSummary:
-    """What was done to the data, in numbers and in words."""
-    columns, tuning = solution.columns, solution.tuning
-    chain, settings = columns.chain, columns.chain.settings
-    rate = settings.sample_rate_hz
-    longest = max(s.samples for s in columns.segments)
-    trimmed = chain.trim_samples(longest) / rate
-    grid = np.geomspace(max(0.01, chain.band_hz / 300.0), 0.5 * rate, 400)
-    return PipelineSummary(
-        sample_rate_hz=rate,
-        steps=_steps(solution, trimmed),
-        lowpass_order=settings.lowpass_order,
-        lowpass_cutoff_hz=settings.lowpass_cutoff_hz,
-        derivative=settings.derivative,
-        decimation=settings.decimation,
-        effective_band_hz=(rate / longest, chain.band_hz),
-        limited_by=chain.limited_by,
-        sign_cutoff_hz=tuning.sign_cutoff_hz,
-        reversal_velocity=columns.reversal_velocity,
-        rows=sum(columns.lengths),
-        trimmed_s=trimmed,
-        f1_hz=tuning.f1_hz,
-        f1_source=tuning.f1_source,
-        magnitude_hz=grid,
-        magnitude=chain.magnitude(grid),
-    )
-
-
-def _steps(solution: Solution, trimmed: float) -> tuple[str, ...]:
-    settings = solution.columns.chain.settings
-    steps = []
-    if settings.lowpass_cutoff_hz is not None:
-        steps.append(
-            f"zero-phase Butterworth low pass on every column, order {settings.lowpass_order} each way,"
-            f" {settings.lowpass_cutoff_hz:.4g} Hz (-6 dB)"
-        )
-    if settings.derivative == "exact":
-        steps.append(
-            f"exact derivative, {2 * solution.columns.chain.half_width + 1}-point maximally flat difference"
-        )
-    else:
-        steps.append("central difference, repeated for higher derivatives (eq. 22)")
-    width = solution.columns.reversal_velocity
-    shape = f"tanh(v / {width:.3g})" if width else "sgn v"
-    steps.append(f"friction sign {shape} from the velocity below {solution.tuning.sign_cutoff_hz:.4g} Hz")
-    if settings.decimation > 1:
-        edge = 0.5 * DECIMATION_EDGE * settings.sample_rate_hz / settings.decimation
-        steps.append(
-            f"parallel decimation by {settings.decimation}: zero-phase Chebyshev I, order 8, 0.05 dB,"
-            f" {edge:.4g} Hz, one row in {settings.decimation}"
-        )
-    steps.append(f"{trimmed:.3g} s trimmed at each edge of each segment")
-    return tuple(steps)
-
-
-def _delay_test(delay: budget.Nuisance, solution: Solution) -> dict[str, Any]:
-    rate = solution.columns.recording.sample_rate_hz
-    known = bool(np.isfinite(delay.stderr))
-    return {
-        "value_s": delay.value if known else None,
-        "stderr_s": delay.stderr if known else None,
-        "value_samples": delay.value * rate if known else None,
-        "meaning": "delay of the acting torque after its stamp as the residuals show it; not applied",
-    }
 
 
 def _profile(solution: Solution, config: Config, uncertainty: Uncertainty) -> dict[str, dict[str, Any]]:
@@ -463,7 +479,9 @@ def _warnings(solution: Solution, uncertainty: Uncertainty, config: Config, doub
     warnings += solution.notes
     # With physics missing the residuals' delay is a symptom, not a timing that could be set.
     if not doubt:
-        warnings += _delay_warning(solution, uncertainty.delay, config)
+        warnings += timing.delay_warning(solution, uncertainty.delay, config)
+        if uncertainty.skew is not None:
+            warnings += timing.skew_warning(solution, uncertainty.skew, config)
     if uncertainty.gear is not None:
         ratio = config.axis.gear_ratio * (1.0 + uncertainty.gear.value)
         warnings.append(
@@ -479,20 +497,3 @@ def _warnings(solution: Solution, uncertainty: Uncertainty, config: Config, doub
             f"{model}: the effective band ends at {band:.3g} Hz, below the resonance at {f1:.3g} Hz"
         )
     return tuple(warnings)
-
-
-def _delay_warning(solution: Solution, delay: budget.Nuisance, config: Config) -> list[str]:
-    samples = delay.value * solution.columns.recording.sample_rate_hz
-    if not np.isfinite(delay.stderr) or abs(delay.value) < SIGNIFICANT_SIGMA * delay.stderr:
-        return []
-    if abs(samples) < SIGNIFICANT_DELAY_SAMPLES:
-        return []
-    role, torque = config.signals.torque_role, config.signals.torque
-    cure = f"signals.{role}.delay_s: {(torque.delay_s or 0.0) - delay.value:.3g}"
-    if torque.hold is None and abs(samples - 0.5) < HALF_SAMPLE_TOLERANCE:
-        cure = f"signals.{role}.hold: sample"
-    text = (
-        f"{solution.model.id}: the torque seems to act {1e3 * delay.value:.3g} ms ({samples:.2g} samples) after its"
-        f" stamp; if the drive's timing confirms it, set {cure}"
-    )
-    return [text]

@@ -14,7 +14,7 @@ from flexid_cli.readers.packed import Fault
 
 T = TypeVar("T")
 _BLOCK = 1 << 19  # bytes of text parsed at once
-_CHECKED = 1 << 18  # bytes that are worth a block of their own
+_CHECKED = 1 << 16  # bytes that are worth a block of their own
 _LONGEST_LINE = 1 << 20
 _TAIL = 1 << 12  # bytes of the last lines, to judge the very last by
 _LONGEST_CHARACTER = 4  # bytes in UTF-8

@@ -5,9 +5,10 @@ from __future__ import annotations
 import io
 from typing import TYPE_CHECKING, Any
 
+from flexid_cli.report import diagnosis_words as say
 from flexid_cli.report import words
 from flexid_cli.report.diagnosis_console import diagnosis_lines
-from flexid_cli.report.lines import Line, estimates
+from flexid_cli.report.lines import Line, Table, estimates, fitting
 from flexid_cli.report.numbers import format_significant
 
 if TYPE_CHECKING:
@@ -123,14 +124,40 @@ def _model(model: Mapping[str, Any], width: int) -> Iterator[Line]:
     yield Line(words.verdict_sentence(model))
     yield Line("")
     yield from estimates(model["parameters"], width)
+    yield from _records(model, width)
     if model["derived"]:
         yield Line("")
         yield from estimates(model["derived"], width)
+    yield from _joined(model, width)
     yield Line("")
-    for name, verdict, reason in words.reasons([*model["parameters"], *model["derived"]]):
+    for name, verdict, reason in words.reasons(words.reported(model)):
         yield Line(f"{name} ({verdict}): {reason}")
+    for names, advice in words.advices([*model["parameters"], *model["derived"]]):
+        yield Line(f"To determine {names}, record {advice}.")
     yield Line(words.fit_sentence(model))
     yield Line(words.band_sentence(model))
+
+
+def _joined(model: Mapping[str, Any], width: int) -> Iterator[Line]:
+    """Effects that were named, and the parameters without them."""
+    for effect in model.get("effects", ()):
+        yield Line("")
+        yield Line(f"With {say.joined_effect(effect)}")
+        yield from estimates(effect["parameters"], width)
+    if model.get("parameters_before"):
+        yield Line("")
+        yield Line(words.WITHOUT_EFFECTS)
+        yield from estimates(model["parameters_before"], width)
+
+
+def _records(model: Mapping[str, Any], width: int) -> Iterator[Line]:
+    """Estimates of each record of a joint fit, beside the joint ones."""
+    titles, rows = words.records_table(model)
+    if rows:
+        right = (False, *(True for _ in titles[1:]))
+        yield Line("")
+        yield Line(words.ALONE)
+        yield from fitting(Table(titles, right, tuple(rows), tuple("" for _ in rows)), width)
 
 
 def _warnings(document: Mapping[str, Any]) -> Iterator[Line]:

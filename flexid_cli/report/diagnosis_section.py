@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         Tested,
         Where,
     )
+    from flexid_cli.estimate.result import ModelEffect
 
 _NOT_JUDGED = "the record could not be judged"
 _NOT_COMPUTED = "could not be computed from this record"
@@ -71,6 +72,23 @@ def _effect(effect: NamedEffect) -> dict[str, Any]:
         "evidence": _evidence(effect.evidence),
         "where": _where(effect.where),
         **_library(effect.name),
+    }
+
+
+def model_effect_section(effect: ModelEffect) -> dict[str, Any]:
+    """One entry of a model's ``effects[]``: an effect that the user named, with the evidence for it."""
+    from flexid_cli.diagnose.result import Evidence
+
+    found = Evidence(
+        effect.statistic, effect.threshold, effect.p_value, effect.held_out_gain, effect.stability
+    )
+    return {
+        "name": effect.name,
+        "code": effect.code,
+        "family": effect.family,
+        "term": _library(effect.name)["term"],
+        "parameters": [parameter_section(one) for one in effect.parameters],
+        "evidence": _evidence(found),
     }
 
 

@@ -83,6 +83,13 @@ def explained_percent(gain: float | None) -> str:
     return rounded(-100.0 * math.expm1(-gain))
 
 
+def joined_effect(effect: Mapping[str, Any]) -> str:
+    """Name of an effect that was joined to a model by name, and what it explains."""
+    gain = effect["evidence"]["statistic"]
+    share = "" if gain is None else f", explains {explained_percent(gain)} %"
+    return f"{effect['name']} ({effect['code']}{share})"
+
+
 def evidence_sentence(evidence: Mapping[str, Any]) -> str:
     """How sure the name is."""
     text = (

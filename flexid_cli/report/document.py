@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flexid_cli import __version__
-from flexid_cli.report.diagnosis_section import diagnosis_section
+from flexid_cli.report.diagnosis_section import diagnosis_section, model_effect_section
 from flexid_cli.report.parameter import finite, parameter_section
 
 if TYPE_CHECKING:
@@ -84,6 +84,8 @@ class InputFile:
     role : {"recording", "validation", "parameters"}
         What the file was used for: the run itself, the other run on which a diagnosis is checked, or the report
         whose parameters were taken as known.
+    record : str
+        Name of the record that it belongs to, where several are fitted together.
     """
 
     path: str
@@ -94,6 +96,7 @@ class InputFile:
     damage: Damage | None = None
     notes: tuple[str, ...] = ()
     role: str = "recording"
+    record: str = ""
 
 
 def build_document(
@@ -105,6 +108,7 @@ def build_document(
     identification: Identification | None = None,
     diagnosis: Diagnosis | None = None,
     validation: Recording | None = None,
+    records: Mapping[str, Recording] | None = None,
     citations: Sequence[str] = CITATIONS,
 ) -> dict[str, Any]:
     """Build the report of an identification or of a diagnosis.
@@ -125,6 +129,8 @@ def build_document(
         Where simulation and recording differ, and why.
     validation : Recording, optional
         The other run, whose files are the inputs of that role.
+    records : mapping of str to Recording, optional
+        Records that were fitted together, by name; ``recording`` is then the account of all of them.
     citations : sequence of str
         References for the methods that were used.
 
@@ -145,10 +151,10 @@ def build_document(
     document = {
         "schema": SCHEMA,
         "tool": {"name": "flexid", "version": __version__},
-        "inputs": _inputs(inputs, recording, validation),
+        "inputs": _inputs(inputs, recording, validation, records or {}),
         "config": {"sha256": config_digest, "resolved": config_resolved},
         "recording": _recording(recording),
-        "models": [_model(model) for model in models],
+        "models": [{**_model(model), **_records(model, inputs, records or {})} for model in models],
         "skipped": [{"id": model.id, "reason": model.reason} for model in skipped],
         "diagnosis": None if diagnosis is None else diagnosis_section(diagnosis),
         "warnings": _warnings(identification, (recording, validation), inputs),
@@ -173,12 +179,22 @@ def _warnings(
 
 
 def _inputs(
-    inputs: Sequence[InputFile], recording: Recording, validation: Recording | None
+    inputs: Sequence[InputFile],
+    recording: Recording,
+    validation: Recording | None,
+    records: Mapping[str, Recording],
 ) -> list[dict[str, Any]]:
     """Return the files of every role, each with the totals of the recording that it belongs to."""
-    roles = [file.role for file in inputs]
+    owners = [(file.role, file.record) for file in inputs]
     recordings = {"recording": recording, "validation": validation}
-    return [_input(f, recordings.get(f.role), single=roles.count(f.role) == 1) for f in inputs]
+    return [
+        _input(
+            file,
+            records[file.record] if file.record in records else recordings.get(file.role),
+            single=owners.count((file.role, file.record)) == 1,
+        )
+        for file in inputs
+    ]
 
 
 def _input(file: InputFile, recording: Recording | None, *, single: bool) -> dict[str, Any]:
@@ -203,6 +219,7 @@ def _input(file: InputFile, recording: Recording | None, *, single: bool) -> dic
         "damage": None if file.damage is None else _damage(file.damage),
         "damage_reason": unknown if file.damage is None else "",
         "notes": notes,
+        **({"record": file.record} if file.record else {}),
     }
 
 
@@ -281,7 +298,41 @@ def _model(model: ModelResult) -> dict[str, Any]:
         "pipeline": _pipeline(model.pipeline),
         "tests": model.tests,
         "warnings": model.warnings,
+        **_joined(model),
     }
+
+
+def _joined(model: ModelResult) -> dict[str, Any]:
+    """Effects that the user named, and the parameters without them; nothing where none were."""
+    if not model.effects:
+        return {}
+    return {
+        "effects": [model_effect_section(effect) for effect in model.effects],
+        "parameters_before": [parameter_section(estimate) for estimate in model.parameters_before],
+    }
+
+
+def _records(
+    model: ModelResult, inputs: Sequence[InputFile], records: Mapping[str, Recording]
+) -> dict[str, Any]:
+    """Records of a joint estimate, each by itself; nothing where there is one recording."""
+    if not model.records:
+        return {}
+    found = [
+        {
+            "name": one.name,
+            "inputs": [k for k, file in enumerate(inputs) if file.record == one.name],
+            "samples": records[one.name].samples,
+            "duration_s": records[one.name].duration_s,
+            "used": not one.reason,
+            "reason": one.reason,
+            "parameters": [parameter_section(estimate) for estimate in one.parameters],
+            "fit": None if one.fit is None else _fit(one.fit),
+            "tests": one.tests,
+        }
+        for one in model.records
+    ]
+    return {"records": found}
 
 
 def _matrix(matrix: NDArray[np.float64]) -> list[list[float | None]]:

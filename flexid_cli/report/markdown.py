@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
+from flexid_cli.report import diagnosis_words as say
 from flexid_cli.report import words
 from flexid_cli.report.diagnosis_markdown import diagnosis_blocks
 from flexid_cli.report.markdown_text import bullets, code, escape, estimates, numbered, table
@@ -53,16 +54,41 @@ def _verdict(document: Mapping[str, Any]) -> list[str]:
 
 
 def _results(model: Mapping[str, Any]) -> list[str]:
-    blocks = ["### Parameters", estimates(model["parameters"])]
-    reasons = words.reasons([*model["parameters"], *model["regression"], *model["derived"]])
+    blocks = ["### Parameters", estimates(model["parameters"]), *_joined(model), *_records(model)]
+    reasons = words.reasons([*words.reported(model), *model["regression"]])
     if reasons:
         lines = [f"**{escape(name)}** ({verdict}): {escape(reason)}" for name, verdict, reason in reasons]
         blocks += ["### Reasons", bullets(lines)]
+    advices = words.advices([*model["parameters"], *model["derived"]])
+    if advices:
+        lines = [f"for {escape(names)}: {escape(advice)}" for names, advice in advices]
+        blocks += ["What to record:", bullets(lines)]
     if model["regression"]:
         blocks += ["### Regression", estimates(model["regression"])]
     if model["derived"]:
         blocks += ["### Derived quantities", estimates(model["derived"])]
     return [*blocks, "### Fit", escape(words.fit_sentence(model)), *_tests(model), *_correlations(model)]
+
+
+def _joined(model: Mapping[str, Any]) -> list[str]:
+    """Effects that were named, and the parameters without them."""
+    blocks = []
+    for effect in model.get("effects", ()):
+        blocks += [f"### Effect {escape(say.joined_effect(effect))}", code(effect["term"])]
+        blocks.append(estimates(effect["parameters"]))
+    if model.get("parameters_before"):
+        blocks += [f"### {words.WITHOUT_EFFECTS}", estimates(model["parameters_before"])]
+    return blocks
+
+
+def _records(model: Mapping[str, Any]) -> list[str]:
+    """Estimates of each record of a joint fit, beside the joint ones."""
+    titles, rows = words.records_table(model)
+    if not rows:
+        return []
+    shown = [tuple(escape(cell) if k == 0 else cell for k, cell in enumerate(row)) for row in rows]
+    heads = ["Symbol", "Together", *(escape(title) for title in titles[2:])]
+    return [f"### {words.ALONE}", table(heads, "l" + "r" * (len(heads) - 1), shown)]
 
 
 def _tests(model: Mapping[str, Any]) -> list[str]:

@@ -36,6 +36,7 @@ def parameter_section(estimate: Estimate) -> dict[str, Any]:
         "relative_stderr_percent": finite(estimate.relative_stderr_percent) if has_value else None,
         "verdict": verdict,
         "reason": reason,
+        "advice": "" if verdict == "identified" else estimate.advice,
     }
 
 

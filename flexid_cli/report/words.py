@@ -92,6 +92,38 @@ def estimate_cells(parameter: Mapping[str, Any], *, with_level: bool = False) ->
     return rounded.estimate, interval, format_percent(parameter["relative_stderr_percent"])
 
 
+WITHOUT_EFFECTS = "Parameters of the same model without these effects"
+
+
+def reported(model: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Every estimate of a model that stands in its tables: parameters, those of named effects, derived ones."""
+    joined = [p for effect in model.get("effects", ()) for p in effect["parameters"]]
+    return [*model["parameters"], *joined, *model["derived"]]
+
+
+ALONE = "Each record alone, and what they give together"
+
+
+def records_table(model: Mapping[str, Any]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Titles and rows of the estimates of each record of a joint fit beside the joint ones; estimate ± stderr."""
+    used = [record for record in model.get("records", ()) if record["used"]]
+    joint = {p["symbol"]: p for p in model["parameters"]}
+    alone = [{p["symbol"]: p for p in record["parameters"]} for record in used]
+    symbols = dict.fromkeys(symbol for one in alone for symbol in one)
+    rows = []
+    for symbol in symbols:
+        together = _with_stderr(joint[symbol]) if symbol in joint else "its own"
+        rows.append((symbol, together, *(_with_stderr(one.get(symbol)) for one in alone)))
+    return ("", "together", *(record["name"] for record in used)), rows
+
+
+def _with_stderr(parameter: Mapping[str, Any] | None) -> str:
+    if parameter is None or parameter["estimate"] is None:
+        return MISSING
+    rounded = round_estimate(parameter["estimate"], parameter["stderr"])
+    return rounded.estimate if rounded.stderr == MISSING else f"{rounded.estimate} ± {rounded.stderr}"
+
+
 def reasons(parameters: Iterable[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
     """Names, verdict and reason of the parameters that have a reason; those with the same one stand together."""
     together: dict[tuple[str, str], list[str]] = {}
@@ -99,6 +131,15 @@ def reasons(parameters: Iterable[Mapping[str, Any]]) -> list[tuple[str, str, str
         if p["reason"]:
             together.setdefault((VERDICTS[p["verdict"]], p["reason"]), []).append(human_name(p))
     return [(", ".join(names), verdict, reason) for (verdict, reason), names in together.items()]
+
+
+def advices(parameters: Iterable[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Return what to record, and the parameters that it would determine; a report of old has no advice."""
+    together: dict[str, list[str]] = {}
+    for p in parameters:
+        if p.get("advice"):
+            together.setdefault(p["advice"], []).append(p["symbol"])
+    return [(", ".join(names), advice) for advice, names in together.items()]
 
 
 def side_sentence(document: Mapping[str, Any]) -> str:

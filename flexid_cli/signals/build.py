@@ -103,7 +103,7 @@ def build_recording(
     DataError
         The signals never overlap in time, or one of them never changes.
     """
-    raw, time = _read(paths, config, options)
+    raw, time = read_raw(paths, config, options)
     return recording_from_raw(raw, config, time), raw
 
 
@@ -171,7 +171,7 @@ def _max_gap(config: Config) -> float | None:
 # --- reading ------------------------------------------------------------
 
 
-def _read(paths: Sequence[Path], config: Config, options: ReadOptions) -> tuple[RawLog, RawChannel | None]:
+def read_raw(paths: Sequence[Path], config: Config, options: ReadOptions) -> tuple[RawLog, RawChannel | None]:
     """Return the log, and the channel that holds its times where these are not the log's own stamps."""
     from flexid_cli.readers.registry import open_reader, read_log
 
@@ -339,6 +339,19 @@ def _choose(
     if wanted is None and name != CLOCKS[0]:
         notes = (f"clock: {name}, for {reason}; its stamps hold the delays of the transport",)
     return _Clock(name, reason, {role: (c.stamps[name], None) for role, c in channels.items()}, notes)
+
+
+def motor_stamps(raw: RawLog, config: Config, time: RawChannel | None = None) -> IntArray | None:
+    """Stamps of the motor position in ns by the clock that a recording would have, shape (n,).
+
+    None where the configuration gives a fixed rate instead of a clock. See `recording_from_raw` for the rest.
+    """
+    sources = _sources(config)
+    clock = _choose(raw, {role: raw.channels[source] for role, source in sources.items()}, config, time)
+    if clock.name == "fixed_rate":
+        return None
+    stamps, valid = clock.stamps["motor_position"]
+    return stamps if valid is None else stamps[valid]
 
 
 def _require_equal_length(channels: Mapping[str, RawChannel], samples: int, clock: str) -> None:

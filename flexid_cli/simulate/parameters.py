@@ -114,7 +114,7 @@ def from_report(path: Path, model: str | None = None) -> Given:
 
     All estimates of one model are taken together, for together they fit the record; those that are not identified
     are named in the notes. Effects that the report's diagnosis explains the record with are taken too, with the
-    parameters after it.
+    parameters after it, and those that were named to `flexid identify --with`.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def from_report(path: Path, model: str | None = None) -> Given:
     chosen = _model(path, data, model)
     diagnosis = _object(data.get("diagnosis"))
     explained = diagnosis.get("verdict") in {"explained", "partly_explained"}
-    effects = _report_effects(diagnosis) if explained else ()
+    effects = _report_effects(diagnosis if explained else chosen)
     after = _objects(diagnosis.get("parameters_after")) if explained and model is None else []
     values, notes = _estimates(path, after or _objects(chosen.get("parameters")))
     pipeline = _object(chosen.get("pipeline"))

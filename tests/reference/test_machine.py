@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -309,6 +311,50 @@ def test_lists_are_large_and_disjoint():
         assert all(kinds.count(k) >= 12 for k in set(kinds))
     assert not seeds[0] & seeds[1]
     assert len(names) == sum(map(len, seeds))
+
+
+def test_the_first_lists_stay_as_they_were():
+    """What was measured on their seeds would not be comparable else."""
+    first = ("singles", "nulls", "pairs", "motor_only", "outside")
+    for which, digest in (("calibration", "b63d3d67b4d254cd"), ("test", "e12fc81cf9450fc3")):
+        every = [t for group in first for t in tasks(group, which)]
+        text = repr([(t.group, t.kinds, t.seed, t.motor_only, t.seconds) for t in every])
+        assert hashlib.sha256(text.encode()).hexdigest()[:16] == digest
+        assert not any(t.near_rest for t in every)
+
+
+def test_the_list_of_the_paper():
+    found = tasks("paper", "calibration")
+    assert all(t.motor_only and t.near_rest for t in found)
+    assert {t.kinds for t in found} == set(effects_module.PAPER_KINDS)
+    gravity = next(t for t in found if t.kinds == ("gravity",))
+    made = make(replace(gravity, seconds=SHORT))
+    # Eq. (17): at the rest position, about which the axis moves, gravity has no moment.
+    assert made.truth["extra"] == {}
+    assert made.truth["base"]["MX"] == 0.0
+    assert made.truth["base"]["MY"] != 0.0
+    assert abs(np.mean(made.a.motor_position)) < 0.2 * np.ptp(made.a.motor_position)
+
+
+def test_dropped_friction_is_what_eq_18_leaves_of_the_torque():
+    """By the torque and the motion of the motor, and the true X1 to X7: nothing of this is in `share`."""
+    task = next(t for t in tasks("paper", "calibration") if t.kinds == ("dropped_friction",))
+    made = make(replace(task, seconds=(12.0, 13.0)))
+    a, record = made.plant.axis, made.a
+    x1, x2 = a.JL / a.K, a.FV / a.K
+    x4, x5 = (a.Jm * a.FV + a.JL * a.FVm) / a.K, a.Jm + a.JL + a.FV * a.FVm / a.K
+    n = record.truth.acting_torque.size
+    taper = np.hanning(n)
+    torque, acceleration, velocity, sign = (
+        np.fft.rfft(taper * x)
+        for x in (record.truth.acting_torque, *(record.truth.means[k] for k in ("qm_dd", "qm_d", "sgn_m")))
+    )
+    s = 2j * np.pi * np.fft.rfftfreq(n, 1.0 / record.rate_hz)
+    motion = (a.Jm * x1 * s**2 + x4 * s + x5) * acceleration + (a.FVm + a.FV) * velocity
+    left = (1.0 + x2 * s + x1 * s**2) * torque - motion - a.FSm * sign
+    left[np.abs(s) > 2.0 * np.pi * effects_module.DROPPED_BAND * a.free_hz] = 0.0
+    size = rms(np.fft.irfft(left, n)) / rms(taper * record.truth.acting_torque)
+    assert size == pytest.approx(made.truth["share"][0], rel=0.2)
 
 
 @pytest.mark.parametrize("size", ["small", "medium", "large", None])

@@ -120,6 +120,58 @@ def test_after_the_repair():
     assert set(scores.values()) == {(3, 5)}
 
 
+def test_what_the_baseline_holds_of_the_paper_is_nothing_hidden():
+    held, both = ["dropped_friction"], ["dropped_friction", "gravity"]
+    fine = _result(held, group="paper", verdict="adequate")
+    alarm = _result(held, ("backlash",), group="paper")
+    named = _result(both, ("gravity", "torque_offset"), group="paper")
+    missing = _result(both, group="paper", verdict="unexplained")
+    assert [diagnosis.missed(r) for r in (fine, named)] == ["", ""]
+    assert diagnosis.missed(alarm) == "an alarm where nothing is hidden"
+    assert diagnosis.missed(missing) == "located, not named"
+    scores = {s.text: (s.hits, s.trials) for s in diagnosis.scores([fine, alarm, named, missing])}
+    assert scores["all that the baseline lacks named, in sets of three"] == (1, 2)
+    assert scores["friction that the baseline holds: adequate"] == (1, 2)
+    assert scores["wrong name alone"] == (1, 4)
+
+
+def test_the_small_version_fails_where_something_is_clearly_wrong():
+    right = [_result(["cogging"], ("cogging",)) for _ in range(diagnosis.SMALL_NAMED)]
+    null = _result([NONE], group="nulls", verdict="adequate")
+    outside = _result(["end_stop"], group="outside", verdict="unexplained")
+    assert diagnosis.small_faults([*right, null, outside]) == []
+    # Something that is only missed is no fault as long as enough is named.
+    assert diagnosis.small_faults([*right, _result(["cogging"], verdict="unexplained")]) == []
+    for wrong, why in [
+        (_result(["cogging"], ("backlash",)), "a confident wrong name"),
+        (_result(["end_stop"], ("gravity",), group="outside"), "a confident wrong name"),
+        (_result([NONE], group="nulls", verdict="unexplained"), "an alarm"),
+        (_result(["end_stop"], group="outside", verdict="adequate"), "the library does not have it"),
+        (_result(["cogging"], verdict="error", error="ValueError: x"), "ValueError: x"),
+    ]:
+        [fault] = diagnosis.small_faults([*right, wrong])
+        assert why in fault
+    [fault] = diagnosis.small_faults(right[1:])
+    assert fault.startswith(f"{len(right) - 1} cases named right")
+
+
+def test_the_small_version_runs_its_own_cases(monkeypatch, capsys):
+    jobs = list(diagnosis.small_jobs(diagnosis.TOOL))
+    assert [(j.group, j.task.kinds) for j in jobs] == list(diagnosis.SMALL)
+    assert all(j.task.seed < 5_000_000 for j in jobs)  # the test's begin there
+    monkeypatch.setattr(diagnosis, "small_jobs", lambda tool: [replace(jobs[0], tool=tool)])
+    assert diagnosis.main(["--small", "--tool", f"{__name__}:refuses"]) == 1
+    assert "too little motion" in capsys.readouterr().out
+
+
+def test_the_paper_s_own_route_stands_beside(monkeypatch):
+    task = next(t for t in diagnosis.tasks("paper", "calibration") if t.kinds == ("dropped_friction",))
+    task = replace(task, seconds=(8.0, 9.0))
+    result, _ = diagnosis.run(diagnosis.Job("paper", task.name, f"{__name__}:stand_in", task=task))
+    assert isinstance(result["K_paper"], float)
+    assert abs(result["K_paper"] / result["K"] - 1.0) > 0.1  # Table 3's inversion, friction's terms left out
+
+
 def test_summary_reads_objects_and_dictionaries():
     interval = SimpleNamespace(low=1.0, high=2.0)
     k = SimpleNamespace(symbol="K", verdict="identified", interval=interval)
