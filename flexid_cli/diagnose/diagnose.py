@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -131,7 +131,8 @@ class _Report:
         named = self._effects(solved_after, evidence.held_out_gain(*unseen))
         doubt = self._doubt()
         parameters_before = self._base_parameters(before, solved_before, doubt)
-        parameters_after = self._base_parameters(after, solved_after, doubt)
+        alternatives = [f for group in self.selection.alternatives for f in group] if named else []
+        parameters_after = self._base_parameters(after, solved_after, doubt, alternatives)
         place = self._place()
         share = 1.0 - max(after.cost - after.y.size, 0.0) / max(before.cost - before.y.size, 1e-300)
         equation, variable = (place.equation, place.variable) if place else ("motor", "velocity")
@@ -164,10 +165,13 @@ class _Report:
             return "no resonance stands out of the record, so the motor encoder alone does not show the stiffness"
         return ""
 
-    def _base_parameters(self, fitted: Fitted, result: Solved, doubt: str) -> tuple[Estimate, ...]:
+    def _base_parameters(
+        self, fitted: Fitted, result: Solved, doubt: str, alternatives: Sequence[Fitted] = ()
+    ) -> tuple[Estimate, ...]:
         found = base_estimates(
             fitted,
             result,
+            alternatives,
             linear=self.recording.linear,
             torque_unit=self.recording.torque_unit,
             level=self.config.estimate.confidence_level,

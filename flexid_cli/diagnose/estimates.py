@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -167,11 +168,30 @@ def _noise_rows(problem: Problem, seed: int) -> tuple[Array, Array]:
     return problem.noise_rows(noisy)
 
 
+def _values(fitted: Fitted) -> dict[str, float]:
+    """The baseline's parameters as the fit gives them, by symbol."""
+    problem, coefficients = fitted.problem, fitted.basis.coefficients
+    values = {
+        n: problem.linearised(n) + float(coefficients[k]) for k, n in enumerate(problem.names) if n != "c"
+    }
+    if problem.both:
+        values |= {n: values[n] * values["K"] / problem.stiffness for n in SCALED}
+        values["K"] -= fitted.stiffening
+    return values
+
+
 def base_estimates(
-    fitted: Fitted, result: Solved, *, linear: bool, torque_unit: str, level: float
+    fitted: Fitted,
+    result: Solved,
+    alternatives: Sequence[Fitted] = (),
+    *,
+    linear: bool,
+    torque_unit: str,
+    level: float,
 ) -> tuple[Estimate, ...]:
-    """The baseline's parameters."""
+    """The baseline's parameters; their intervals hold what they are with the ``alternatives`` that explain as well."""
     problem = fitted.problem
+    here, others = _values(fitted), [_values(f) for f in alternatives]
     out = []
     for parameter in BASE_PARAMETERS:
         if parameter.symbol not in problem.names:
@@ -179,7 +199,8 @@ def base_estimates(
         k = problem.names.index(parameter.symbol)
         value = float(result.coefficients[k])
         value += problem.linearised(parameter.symbol)
-        stderr = float(np.sqrt(max(result.covariance[k, k], 0.0)))
+        away = max((abs(v[parameter.symbol] - here[parameter.symbol]) for v in others), default=0.0)
+        stderr = float(np.hypot(np.sqrt(max(result.covariance[k, k], 0.0)), 0.5 * away))
         unit = unit_of(parameter.quantity, linear=linear, torque_unit=torque_unit)
         out.append(
             judge(

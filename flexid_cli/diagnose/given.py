@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from flexid_cli.diagnose.diagnose import forms_of, torque_shifts
 from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter, without
 from flexid_cli.diagnose.given_model import Joined, model_result
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.search import Candidate
-from flexid_cli.diagnose.start import first_problem
+from flexid_cli.diagnose.start import first_problems
 from flexid_cli.effects.base import Effect
 from flexid_cli.effects.registry import effect as effect_named
 from flexid_cli.errors import DataError, UsageError
@@ -105,12 +106,12 @@ def _joined_model(recording: Recording, config: Config, model_id: str, wanted: S
     own = tuple(e for e in wanted if e.name not in PART_OF[model_id] or view.linear)
     for effect in own:
         _check_signals(effect, fitter, model_id, linear=view.linear)
-    baseline = fitter.relax(first_problem(view, config, fitter))
-    before, _ = _joined(fitter, baseline, JOINED_TO[model_id])
+    fits = [
+        _before_and_after(fitter, problem, JOINED_TO[model_id], own)
+        for problem in first_problems(view, config, fitter)
+    ]
+    before, after, refused = min(fits, key=lambda fit: (not fit[1].is_possible, fit[1].loss))
     names = [e.name for e in own if e.name not in {c.name for c in before.chosen}]
-    after, refused = _joined(fitter, before, names)
-    if len(names) > 1:
-        after = _searched_again(fitter, after, names)
     told = tuple(
         f"{model_id}: {e.name} is part of the model with and without being named"
         for e in wanted
@@ -118,6 +119,16 @@ def _joined_model(recording: Recording, config: Config, model_id: str, wanted: S
     )
     effects = tuple(e for e in own if e.name in names)
     return Joined(model_id, fitter, before, after, effects, refused, told, view, config)
+
+
+def _before_and_after(
+    fitter: Fitter, problem: Problem, always: Sequence[str], own: Sequence[Effect]
+) -> tuple[Fitted, Fitted, Mapping[str, str]]:
+    """The model without and with the effects from one start, and why some could not join."""
+    before, _ = _joined(fitter, fitter.relax(problem), always)
+    names = [e.name for e in own if e.name not in {c.name for c in before.chosen}]
+    after, refused = _joined(fitter, before, names)
+    return before, _searched_again(fitter, after, names) if len(names) > 1 else after, refused
 
 
 def _check_signals(effect: Effect, fitter: Fitter, model_id: str, *, linear: bool) -> None:

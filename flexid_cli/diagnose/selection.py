@@ -73,7 +73,7 @@ def most_promising(fitter: Fitter, problems: Sequence[Problem]) -> Problem:
     def loss(problem: Problem) -> float:
         fitted = fitter.relax(problem, rounds=1)
         best = _added(fitter, fitted, fitter.candidates(fitted))
-        return fitted.loss if best is None else min(best.loss, fitted.loss)
+        return min((f.loss for f in (fitted, best) if f is not None and f.is_possible), default=np.inf)
 
     return min(problems, key=loss)
 
