@@ -26,7 +26,7 @@ from flexid_cli.diagnose.result import (
 from flexid_cli.diagnose.search import Candidate, Form
 from flexid_cli.diagnose.selection import Selection, most_promising, select, threshold
 from flexid_cli.diagnose.simulation import simulation_error
-from flexid_cli.diagnose.start import first_problem, first_problems, has_joint
+from flexid_cli.diagnose.start import first_problems, has_joint
 from flexid_cli.effects.base import EffectValues
 from flexid_cli.effects.registry import effects as library
 from flexid_cli.estimate.result import Estimate
@@ -119,8 +119,7 @@ class _Report:
         self.maps = residual_maps(selection.before.problem, selection.before.basis)
         self.other = None
         if validation is not None:
-            # A model is checked in the band that it was fitted in.
-            self.other = first_problem(validation, config, fitter, selection.before.problem.band_hz)
+            self.other = first_problems(validation, config, fitter, self.final.problem)[0]
 
     def diagnosis(self) -> Diagnosis:
         """Assemble the result."""

@@ -189,7 +189,7 @@ def base_estimates(
     torque_unit: str,
     level: float,
 ) -> tuple[Estimate, ...]:
-    """The baseline's parameters; their intervals hold what they are with the ``alternatives`` that explain as well."""
+    """The baseline's parameters; their intervals hold those of the ``alternatives`` that explain as well."""
     problem = fitted.problem
     here, others = _values(fitted), [_values(f) for f in alternatives]
     out = []

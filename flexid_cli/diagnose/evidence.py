@@ -78,7 +78,9 @@ def cross_validated(fitted: Fitted) -> Array:
 def predicted(problem: Problem, fitter: Fitter, fitted: Fitted) -> Array:
     """Residual rows of another record with all parameters of ``fitted``."""
     here = fitted.problem
-    other = problem.at(here.base, shift=here.shift, applied=here.applied, stiffening=here.stiffening)
+    other = problem.at(
+        here.base, shift=here.shift, applied=here.applied, stiffening=here.stiffening, led=here.led
+    )
     held = {c.form: fitted.slopes(k) for k, c in enumerate(fitted.chosen)}
     there = fitter.fit(other, fitted.chosen, Search(other, fitter.forms, held))
     return np.asarray(there.y - there.basis.columns @ fitted.basis.coefficients)

@@ -41,19 +41,13 @@ def has_joint(recording: Recording, config: Config) -> bool:
     return recording.has_joint_position and config.models != ("rigid",)
 
 
-def first_problem(
-    recording: Recording, config: Config, fitter: Fitter, highest_hz: float = np.inf
-) -> Problem:
-    """The most likely of `first_problems`."""
-    return first_problems(recording, config, fitter, highest_hz)[0]
-
-
 def first_problems(
-    recording: Recording, config: Config, fitter: Fitter, highest_hz: float = np.inf
+    recording: Recording, config: Config, fitter: Fitter, fitted: Problem | None = None
 ) -> list[Problem]:
-    """The record in its band, up to ``highest_hz`` at most, linearised where a simple fit puts it.
+    """The record in its band, linearised where a simple fit puts it.
 
-    There are several, the most likely one first, where the motor's encoder alone shows no resonance for sure.
+    There are several, the most likely one first, where the motor's encoder alone shows no resonance for sure. Band and
+    (without a joint encoder) linearisation are those of another record of the axis where that was ``fitted``.
 
     Raises
     ------
@@ -62,7 +56,7 @@ def first_problems(
     """
     both = has_joint(recording, config)
     rate = recording.sample_rate_hz
-    band = min(usable_band(recording, joint=both), HIGHEST_BAND * rate, highest_hz)
+    band = min(usable_band(recording, joint=both), HIGHEST_BAND * rate, fitted.band_hz if fitted else np.inf)
     rigid = config.models == ("rigid",)
     if rigid:
         band = min(band, torque_band(recording))  # above it springs and noise would be all there is
@@ -99,7 +93,7 @@ def first_problems(
     )
     if both or rigid:
         return [_with_torque_noise(fitter.relax(problem, rounds=1).problem)]
-    known = _identified(recording, config, width)
+    known = _identified(recording, config, width) if fitted is None else fitted.base
     problems = _scanned(problem, fitter) if known is None else [problem.at(known)]
     for one in problems:
         one.anchor, one.settled = one.base, known is not None
