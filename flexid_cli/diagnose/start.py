@@ -46,8 +46,8 @@ def first_problems(
 ) -> list[Problem]:
     """The record in its band, linearised where a simple fit puts it.
 
-    There are several, the most likely one first, where the motor's encoder alone shows no resonance for sure. Band and
-    (without a joint encoder) linearisation are those of another record of the axis where that was ``fitted``.
+    There are several, the most likely one first, where the motor's encoder alone shows no resonance for sure. Band
+    and (without a joint encoder) linearisation are those of another record of the axis where that was ``fitted``.
 
     Raises
     ------
