@@ -68,6 +68,13 @@ NOTHING_IDENTIFIED = 3
     is_flag=True,
     help="Set friction, gravity and offsets that the data cannot tell from zero to zero, and fit the rest again.",
 )
+@click.option(
+    "--replay",
+    type=click.IntRange(0, 1000),
+    metavar="N",
+    help="Simulate the fitted axis N times with the record's noise, estimate again, and report each parameter's"
+    " bias; the estimates stay as they are (50 replays are plenty).",
+)
 @records_option
 @set_option
 @read_options
@@ -83,6 +90,7 @@ def identify(
     route: str | None,
     effects: tuple[str, ...],
     essential: bool,
+    replay: int | None,
     records_mode: Mode,
     overrides: tuple[str, ...],
     start: float | None,
@@ -109,6 +117,8 @@ def identify(
         overrides = (*overrides, f"estimate.route={route}")
     if essential:
         overrides = (*overrides, "estimate.essential=true")
+    if replay is not None:
+        overrides = (*overrides, f"estimate.replay={replay}")
     overrides = (*overrides, *with_override(effects))
     loaded = load_config_with_effects(config, overrides)
     with reading(console, start, end, strict=strict, keep_suspect=keep_suspect) as options:

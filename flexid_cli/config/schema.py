@@ -317,6 +317,14 @@ class EstimateOptions(Model):
         description="Set friction, gravity and offsets that the data cannot tell from zero to zero, by backward"
         " elimination at the level 1 - confidence_level, and fit the rest again.",
     )
+    replay: int = Field(
+        default=0,
+        ge=0,
+        le=1000,
+        description="Simulate the fitted axis this many times (2 or more; 0: not at all) with the record's noise,"
+        " estimate again, and report the bias of each parameter; the estimates stay as they are.",
+        examples=[50],
+    )
     effects: Annotated[tuple[Text, ...], BeforeValidator(_to_tuple)] | None = Field(
         default=None,
         alias="with",
@@ -800,6 +808,30 @@ def _rule_essential(view: _View) -> Iterator[BrokenRule]:
         )
 
 
+def _rule_replay(view: _View) -> Iterator[BrokenRule]:
+    count = view.get("estimate", "replay")
+    if not count or view.is_wrong("estimate", "replay"):
+        return
+    if count == 1:
+        yield BrokenRule(
+            "one replay tells no bias from chance",
+            ("estimate", "replay"),
+            "take 2 or more (50 are plenty), or 0 for none",
+        )
+    if view.get("estimate", "route") == "paper":
+        yield BrokenRule(
+            "route paper reproduces the paper's tables, which have no bias budget",
+            ("estimate", "replay"),
+            "take one of `replay` and `route: paper` out",
+        )
+    if view.get("estimate", "with"):
+        yield BrokenRule(
+            "the fitted axis is not replayed with named effects joined to the model",
+            ("estimate", "replay"),
+            "take one of `replay` and `with` (--with) out",
+        )
+
+
 def _rule_csv(view: _View) -> Iterator[BrokenRule]:
     delimiter, encoding = view.get("csv", "delimiter"), view.get("csv", "encoding")
     if delimiter is not None and delimiter == view.get("csv", "decimal"):
@@ -850,6 +882,7 @@ _RULES: tuple[Callable[[_View], Iterator[BrokenRule]], ...] = (
     _rule_models,
     _rule_per_record,
     _rule_essential,
+    _rule_replay,
     _rule_csv,
     _rule_simulation,
 )

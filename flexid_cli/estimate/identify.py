@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.errors import DataError
-from flexid_cli.estimate import band, budget, methods, paper_route, summary
+from flexid_cli.estimate import band, budget, methods, paper_route, replay, summary
 from flexid_cli.estimate.fit import FitResult, block_matrices, block_matrix, fit
 from flexid_cli.estimate.least_squares import solve, triangle
 from flexid_cli.estimate.result import Identification, ModelResult, Skipped
@@ -101,10 +101,16 @@ def _solve(recording: Recording, config: Config, model_id: str, f1: float | None
     if config.estimate.route == "paper" and model_id != "rigid":
         tuning = band.choose_tuning(recording, config, model_id, f1)
         return paper_route.solve_paper(make_columns(recording, config, tuning), config, model_id, tuning)
-    solution = solve_direct(recording, config, model_id, f1)
-    if config.estimate.essential:
-        solution = summary.reduced(solution, config)
-    return summary.summarise(solution, config)
+
+    def estimate(record: Recording, resonance: float | None) -> Solution:
+        solution = solve_direct(record, config, model_id, resonance)
+        return summary.reduced(solution, config) if config.estimate.essential else solution
+
+    solution = estimate(recording, f1)
+    found, uncertainty = summary.analyse(solution, config)
+    if config.estimate.replay:
+        found = replay.with_replays(found, solution, uncertainty, config.estimate.replay, estimate)
+    return found
 
 
 def solve_direct(recording: Recording, config: Config, model_id: str, f1: float | None) -> Solution:

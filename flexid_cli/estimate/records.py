@@ -111,6 +111,8 @@ def _check(config: Config) -> None:
         raise UsageError("route paper reproduces the tables of one record; several are given", hint)
     if config.estimate.essential:
         raise UsageError("essential parameters are selected on one record; several are given", hint)
+    if config.estimate.replay:
+        raise UsageError("the fitted axis is replayed on one record; several are given", hint)
     if config.estimate.effects:
         raise UsageError("effects join the models of one record; several are given", hint)
 

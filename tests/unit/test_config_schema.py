@@ -38,7 +38,7 @@ def test_defaults_are_those_of_the_contract() -> None:
     }  # fmt: skip
     assert resolved["estimate"] == {
         "method": "auto", "route": "direct", "confidence_level": 0.95, "covariance": "hac",
-        "essential": False,
+        "essential": False, "replay": 0,
     }  # fmt: skip
     assert resolved["pipeline"] == {}
     assert resolved["csv"] == {}
