@@ -24,7 +24,7 @@ from flexid_cli.diagnose.result import (
     Where,
 )
 from flexid_cli.diagnose.search import Candidate, Form
-from flexid_cli.diagnose.selection import Selection, most_promising, select, threshold
+from flexid_cli.diagnose.selection import Selection, select, threshold
 from flexid_cli.diagnose.simulation import simulation_error
 from flexid_cli.diagnose.start import first_problems, has_joint
 from flexid_cli.effects.base import EffectValues
@@ -71,7 +71,7 @@ def diagnose(
     """
     both = has_joint(recording, config)
     fitter = Fitter(forms_of(both, linear=recording.linear), torque_shifts(config))
-    selection = select(fitter, most_promising(fitter, first_problems(recording, config, fitter)))
+    selection = select(fitter, first_problems(recording, config, fitter))
     return _Report(fitter, selection, recording, config, validation, known or {}).diagnosis()
 
 
@@ -131,6 +131,7 @@ class _Report:
         doubt = self._doubt()
         parameters_before = self._base_parameters(before, solved_before, doubt)
         alternatives = [f for group in self.selection.alternatives for f in group] if named else []
+        alternatives += self.selection.elsewhere
         parameters_after = self._base_parameters(after, solved_after, doubt, alternatives)
         place = self._place()
         share = 1.0 - max(after.cost - after.y.size, 0.0) / max(before.cost - before.y.size, 1e-300)

@@ -36,6 +36,8 @@ class Selection:
         Every effect against the baseline.
     rivals : tuple of tuple of (str, float)
         Names of the other effects tried in place of each chosen one, and what they are worse by.
+    elsewhere : tuple of Fitted
+        Fits from other starts that are worse by less than what would name an effect.
     """
 
     before: Fitted
@@ -43,10 +45,12 @@ class Selection:
     alternatives: tuple[tuple[Fitted, ...], ...]
     tested: tuple[Candidate, ...]
     rivals: tuple[tuple[tuple[str, float], ...], ...]
+    elsewhere: tuple[Fitted, ...] = ()
 
 
-def select(fitter: Fitter, problem: Problem) -> Selection:
-    """Search the library for what the record holds beyond the baseline."""
+def select(fitter: Fitter, problems: Sequence[Problem]) -> Selection:
+    """Search the library for what the record holds beyond the baseline, from the likeliest of some linearisations."""
+    problem, elsewhere = _start(fitter, problems)
     enough = threshold(problem)
     before = fitter.relax(problem)
     fitted, tested = before, fitter.candidates(before)
@@ -58,24 +62,29 @@ def select(fitter: Fitter, problem: Problem) -> Selection:
         fitted = _needed(fitter, new, enough)
         found = fitter.candidates(fitted)
     alternatives, rivals = _alternatives(fitter, fitted)
-    return Selection(before, fitted, alternatives, tuple(tested), rivals)
+    return Selection(before, fitted, alternatives, tuple(tested), rivals, elsewhere)
 
 
-def most_promising(fitter: Fitter, problems: Sequence[Problem]) -> Problem:
-    """Of several linearisations the one that is most likely with the one effect that explains most there.
+def _start(fitter: Fitter, problems: Sequence[Problem]) -> tuple[Problem, tuple[Fitted, ...]]:
+    """Of several linearisations the most likely one, and the fits at others that the record cannot exclude.
 
     What the baseline lacks draws its stiffness to where it stands in for it: without an effect the likelihood says
-    little about where to begin.
+    little about where to begin. So each is judged with the one effect that explains most there.
     """
     if len(problems) == 1:
-        return problems[0]
-
-    def loss(problem: Problem) -> float:
+        return problems[0], ()
+    found = []
+    for problem in problems:
         fitted = fitter.relax(problem, rounds=1)
-        best = _added(fitter, fitted, fitter.candidates(fitted))
-        return min((f.loss for f in (fitted, best) if f is not None and f.is_possible), default=np.inf)
-
-    return min(problems, key=loss)
+        both = (fitted, _added(fitter, fitted, fitter.candidates(fitted)))
+        possible = [f for f in both if f is not None and f.is_possible]
+        if possible:
+            found.append((problem, min(possible, key=lambda f: f.loss)))
+    if not found:
+        return problems[0], ()
+    best, fit = min(found, key=lambda start: start[1].loss)
+    near = [f for p, f in found if p is not best and f.loss - fit.loss < threshold(best)]
+    return best, tuple(near)
 
 
 def threshold(problem: Problem) -> float:
