@@ -44,7 +44,7 @@ from flexid_cli.readers.rows import RowReader, Rows
 from flexid_cli.readers.table_gaps import TablePart, lost_rows, suspect_samples, without
 
 _HEAD = 1 << 18
-_WORTH_THREADS = 1 << 24  # bytes of a file; each thread makes a parser of its own
+_LARGE = 1 << 24  # bytes of a file that are worth threads and compiled code
 _SPLICE = 1 << 16  # samples converted in place at once
 # Damage leaves most lines whole. Where more than this share of them does not fit, the table is not written
 # as it seems to be, and what does fit may be read wrong.
@@ -387,9 +387,10 @@ class _Table:
     ) -> Generator[Rows]:
         """Parse block by block in threads, in the order of the file, and keep account."""
         encoding = self._encoding.removesuffix("-sig") if self._raw else "utf-8"
-        parse = RowReader(self.dialect, encoding, wanted)
+        large = _size(self.path) >= _LARGE
+        parse = RowReader(self.dialect, encoding, wanted, compiled=large)
         if threads is None:
-            threads = 1 if _size(self.path) < _WORTH_THREADS else os.cpu_count() or 1
+            threads = os.cpu_count() or 1 if large else 1
         stop = 0
         with closing(in_order(parse, self._blocks(advance), threads)) as items:
             for item in items:

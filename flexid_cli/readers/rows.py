@@ -80,19 +80,23 @@ class RowReader:
         Of text that is no number; a superset of ASCII.
     wanted : sequence of int
         Places of columns from 0. Where there are none, lines are only checked and counted.
+    compiled : bool
+        Whether there is so much that compiled code is worth its start (45 MB of memory and, the first time ever,
+        seconds); what it reads is the same.
     """
 
-    def __init__(self, dialect: Dialect, encoding: str, wanted: Sequence[int]) -> None:
+    def __init__(self, dialect: Dialect, encoding: str, wanted: Sequence[int], *, compiled: bool) -> None:
         self._dialect = dialect
         self._encoding = encoding
         self._wanted = wanted
+        self._compiled = compiled and bool(wanted)
 
     def __call__(self, text: bytes) -> Rows:
         """Read a block of whole lines, each with a line feed at its end, below the header."""
         dialect, wanted = self._dialect, self._wanted
         simple = _simplified(text, dialect)
         if not any(mark[:1] in simple and mark in simple for mark in _high_marks(dialect)):
-            rows = _read_bare(simple, dialect, wanted) if wanted else None
+            rows = _read_bare(simple, dialect, wanted) if self._compiled else None
             if rows is None:
                 rows = _read_plain(simple, dialect, wanted)
             if rows is not None:

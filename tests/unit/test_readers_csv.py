@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexid_cli.errors import InputError
+from flexid_cli.readers import csv as table
 from flexid_cli.readers import rows as blocks
 from flexid_cli.readers.base import DEFAULT_OPTIONS, RawLog, ReadOptions
 from flexid_cli.readers.csv import CsvReader
@@ -29,6 +30,16 @@ from flexid_cli.readers.dialect import (
     split_unit,
 )
 from flexid_cli.readers.registry import list_channels, read_log
+
+
+@pytest.fixture(params=["pandas", "compiled"], scope="module", autouse=True)
+def parser(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Small tables as small ones, and as large ones are read."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.param == "compiled":
+            patch.setattr(table, "_LARGE", 0)
+        yield
+
 
 ROWS = [(0.0, 1.5, -2.25), (0.001, 1.625, -2.5), (0.002, 1.75, -2.75), (0.003, -1.0e-7, 3.0e8)]
 NAMES = ("time", "motor_current", "motor_position")
@@ -561,7 +572,7 @@ def test_blocks_and_single_lines_are_read_alike(lines: list[str], wanted: tuple[
     """Whatever stands in a block, the parser's fast way gives what the lines give one by one, or gives up."""
     fields = tuple(Field(name, None, name) for name in "abc")
     dialect = Dialect(",", ".", ("#", "%", "//"), fields, 1)
-    read_rows = blocks.RowReader(dialect, "utf-8", wanted)
+    read_rows = blocks.RowReader(dialect, "utf-8", wanted, compiled=table._LARGE == 0)
     sound = b"8,9.5,10\n" * 5
     for block in (sound, ("\n".join(lines) + "\n").encode(), sound):
         rows = read_rows(block)
