@@ -79,7 +79,7 @@ SMALL = (
     ("paper", ("gravity",)),
 )
 SMALL_SECONDS = (18.0, 22.0)
-SMALL_NAMED = 5
+SMALL_NAMED = 6
 JUDGES = {
     "bound": "by the Wilson bound, 95 % two-sided",
     "count": "by count",

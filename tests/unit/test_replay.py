@@ -81,6 +81,8 @@ def test_a_known_bias_is_found():
     entry = model.tests["replay"]["parameters"]["K"]
     assert known < -4.0 * error
     assert entry["significant"]
+    # A replay is made at the biased estimate, where the bias is larger than at the truth: by a third at this noise.
+    # That share was set on this record: the test guards sign and order of size, it proves no more.
     tolerance = 4.0 * np.hypot(error, entry["bias_error_percent"]) + 0.3 * abs(known)
     assert entry["bias_percent"] == pytest.approx(known, abs=tolerance)
     [warning] = [w for w in model.warnings if "replays of the fitted axis give K " in w]
