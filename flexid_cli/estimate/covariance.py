@@ -76,11 +76,11 @@ def robust_covariance(scores: Array, bread: Array, lengths: Sequence[int]) -> Ro
     for length in lengths:
         part = influence[start : start + length]
         start += length
-        cosines = _cosines(length, max(1, round(total * length / rows)))
-        transforms = cosines.T @ part
-        covariance += transforms.T @ transforms * (length / cosines.shape[1])
-        series += cosines.shape[1]
-        parts.append((cosines, part))
+        count = min(max(1, round(total * length / rows)), max(length - 1, 1))
+        transforms = np.sqrt(2.0 / length) * _cosine_sums(part, count)[1:]
+        covariance += transforms.T @ transforms * (length / count)
+        series += count
+        parts.append((part, count))
     correction = rows / max(rows - parameters, 1)
     return RobustCovariance(
         covariance=covariance * correction,
@@ -169,27 +169,27 @@ def _parzen(x: float) -> float:
     return 1.0 - 6.0 * x**2 * (1.0 - x) if x <= 0.5 else 2.0 * max(1.0 - x, 0.0) ** 3
 
 
-def _cosines(rows: int, count: int) -> Array:
-    """Orthonormal cosines sqrt(2/T) cos(pi j (t - 1/2) / T), shape (rows, count)."""
-    t = (np.arange(rows) + 0.5) / rows
-    j = np.arange(1, min(count, max(rows - 1, 1)) + 1)
-    return np.asarray(np.sqrt(2.0 / rows) * np.cos(np.pi * np.outer(t, j)), dtype=np.float64)
+def _cosine_sums(x: Array, count: int) -> Array:
+    """Sums of x cos(pi j (t - 1/2) / T) over the rows, for j of 0 to ``count``, shape (count + 1, columns)."""
+    from scipy.fft import dct
+
+    sums = 0.5 * dct(x, axis=0)
+    # At T the cosine is zero, and beyond it that of 2 T - j with its sign turned.
+    return np.concatenate([sums, np.zeros_like(sums[:1]), -sums[::-1]])[: count + 1]
 
 
-def _degrees_of_freedom(parts: Sequence[tuple[Array, Array]]) -> Array:
+def _degrees_of_freedom(parts: Sequence[tuple[Array, int]]) -> Array:
     """Satterthwaite's degrees of freedom of the mean square, tr(M)^2 / tr(M^2) summed over the segments.
 
     M is the covariance of the transforms if the scores were independent with the variances that they show:
     B for a stationary score, less where a short part of the record carries it.
     """
-    parameters = parts[0][1].shape[1]
+    parameters = parts[0][0].shape[1]
     trace, square = np.zeros(parameters), np.zeros(parameters)
-    for cosines, part in parts:
-        rows, count = cosines.shape
+    for part, count in parts:
         variance = np.column_stack([_smooth(x**2, count) for x in part.T])
         # cos j cos k = (cos (j-k) + cos (j+k)) / 2: M follows from 2 B + 1 sums.
-        angle = np.pi * (np.arange(rows) + 0.5) / rows
-        sums = np.cos(np.outer(np.arange(2 * count + 1), angle)) @ variance / count
+        sums = _cosine_sums(variance, 2 * count) / count
         j = np.arange(1, count + 1)
         difference, total = np.abs(j[:, None] - j), j[:, None] + j
         for k in range(parameters):

@@ -7,7 +7,7 @@ interval; where the model bends (a stiffness hardly determined from the motor al
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,8 @@ MAX_STEPS = 25
 SETTLED = 1e-6
 # A bound is looked for up to this many half widths from the estimate; beyond it the interval is open.
 FARTHEST = 8.0
-BISECTIONS = 30
+# Of the half width: far below what is printed.
+TOLERANCE = 1e-6
 
 
 def profile_interval(
@@ -50,39 +51,46 @@ def profile_interval(
         Low and high bound; None where there is none within eight half widths.
     """
 
-    def excess(distance: float, sign: float) -> float | None:
-        step = _remaining_step(model, products, theta, stderr, index, sign * distance)
-        return None if step is None else abs(step) - half_width
+    unit = _variance(model, products, theta, index)
+
+    def excess(distance: float, sign: float) -> float:
+        return abs(_remaining_step(model, products, theta, stderr, index, sign * distance, unit)) - half_width
 
     bounds: list[float | None] = []
     for sign in (-1.0, 1.0):
-        distance = _crossing(lambda d, sign=sign: excess(d, sign), half_width)
+        try:
+            distance = _crossing(lambda d, sign=sign: excess(d, sign), half_width)
+        except ArithmeticError:
+            distance = None
         bounds.append(None if distance is None else float(theta[index] + sign * distance))
     return bounds[0], bounds[1]
 
 
-def _crossing(excess, half_width: float) -> float | None:  # type: ignore[no-untyped-def]
+def _crossing(excess: Callable[[float], float], half_width: float) -> float | None:
+    """Distance at which the excess turns positive, or None."""
+    from scipy.optimize import brentq
+
     low, high = 0.0, half_width
-    while True:
-        value = excess(high)
-        if value is None or high > FARTHEST * half_width:
-            return None
-        if value >= 0.0:
-            break
+    while excess(high) < 0.0:
         low, high = high, 1.5 * high
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        value = excess(middle)
-        if value is None:
+        if high > FARTHEST * half_width:
             return None
-        low, high = (middle, high) if value < 0.0 else (low, middle)
-    return 0.5 * (low + high)
+    return float(brentq(excess, low, high, xtol=TOLERANCE * half_width))
 
 
 def _remaining_step(
-    model: Model, products: Matrices, theta: Array, stderr: Array, index: int, distance: float
-) -> float | None:
-    """Step of the parameter towards the estimate when it is held ``distance`` away and the others have settled."""
+    model: Model,
+    products: Matrices,
+    theta: Array,
+    stderr: Array,
+    index: int,
+    distance: float,
+    unit: float,
+) -> float:
+    """Step of the parameter towards the estimate when it is held ``distance`` away and the others have settled.
+
+    ``unit`` is its variance at the estimate for residuals of unit size; ArithmeticError where they do not settle.
+    """
     held = theta.copy()
     held[index] += distance
     others = np.flatnonzero(np.arange(theta.size) != index)
@@ -92,14 +100,16 @@ def _remaining_step(
         step = -scaled_inverse(normal[np.ix_(others, others)]) @ gradient[others]
         held[others] += step
         if not np.all(np.isfinite(held)):
-            return None
+            break
         if float(np.max(np.abs(step) / scale, initial=0.0)) < SETTLED:
             gradient, normal = equations(model, products, held)
             inverse = scaled_inverse(normal)
             # A step is worth as much as the standard error where it is taken.
-            there, here = inverse[index, index], _variance(model, products, theta, index)
-            return float((inverse @ gradient)[index] * np.sqrt(abs(here / there))) if there else None
-    return None
+            there = inverse[index, index]
+            if there:
+                return float((inverse @ gradient)[index] * np.sqrt(abs(unit / there)))
+            break
+    raise ArithmeticError("the other parameters do not settle")
 
 
 def _variance(model: Model, products: Matrices, theta: Array, index: int) -> float:

@@ -73,26 +73,29 @@ def zero_phase(x: Array, sos: Array, *, settled_edges: bool = True) -> Array:
         then it is the same linear operator for every column whatever its noise at the first sample, which is
         what parallel decimation needs.
     """
-    from scipy.signal import sosfilt
-
     if settled_edges:
         return _settled_both_ways(x, sos)
-    forward = sosfilt(sos, x)
-    return np.asarray(sosfilt(sos, forward[::-1])[::-1], dtype=np.float64)
+    result = np.array(x, dtype=np.float64)
+    return _both_ways(result, sos, np.zeros((sos.shape[0], 2)))
 
 
 def _settled_both_ways(x: Array, sos: Array) -> Array:
     """Forward and backward over the odd extension, each pass from the rest state of its first value."""
-    from scipy.signal import sosfilt
-
     padding = min(settling_samples(sos), x.size - 1)
     before = 2.0 * x[0] - x[padding:0:-1]
     after = 2.0 * x[-1] - x[-2 : -padding - 2 : -1]
     extended = np.concatenate([before, x, after])
     rest = _rest_state(sos.tobytes(), sos.shape[0])
-    forward, _ = sosfilt(sos, extended, zi=rest * extended[0])
-    backward, _ = sosfilt(sos, forward[::-1], zi=rest * forward[-1])
-    return np.ascontiguousarray(backward[::-1][padding : padding + x.size])
+    return _both_ways(extended, sos, rest)[padding : padding + x.size].copy()
+
+
+def _both_ways(x: Array, sos: Array, rest: Array) -> Array:
+    """The samples filtered in place, forward and then backward."""
+    from flexid_cli.pipeline.cascade import filter_in_place
+
+    filter_in_place(x, sos, rest, False)
+    filter_in_place(x, sos, rest, True)
+    return x
 
 
 @lru_cache(maxsize=64)
