@@ -216,10 +216,10 @@ def measure(setting: Setting, seed: int, encoders: Sequence[str]) -> list[dict[s
     for which in encoders:
         line: dict[str, Any] = {"cell": setting.cell(which), "seed": seed}
         start = time.perf_counter()
+        # Filters are set by route; the recording before them is the same.
+        recording = recording_of(run, configuration(machine, which, "direct"), joint=which == "two_encoders")
         for route in ROUTES:
-            config = configuration(machine, which, route)
-            recording = recording_of(run, config, joint=which == "two_encoders")
-            line[route] = outcome(recording, config)
+            line[route] = outcome(recording, configuration(machine, which, route))
             if route == "direct":
                 line["seconds"] = round(time.perf_counter() - start, 3)
         lines.append(line)

@@ -35,7 +35,7 @@ def score(fitter: Fitter, fitted: Fitted, k: int, library: int) -> Score:
     blocks of time, so that coloured residuals do not make it look sure; Bonferroni's correction over the
     ``library`` that was searched.
     """
-    from scipy.stats import t as student
+    from scipy.special import stdtr
 
     chosen = fitted.chosen[k]
     rest = fitter.fit(fitted.problem, without(fitted.chosen, k), fitted.search)
@@ -45,7 +45,7 @@ def score(fitter: Fitter, fitted: Fitted, k: int, library: int) -> Score:
     noise = _blocks(column * fitted.basis.residual, fitted.problem, BLOCKS)
     spread = float(np.sqrt(np.sum(noise**2)))
     statistic = float(parts.sum()) / max(spread, 1e-300)
-    p = 2.0 * float(student.sf(abs(statistic), parts.size - 1))
+    p = 2.0 * float(stdtr(parts.size - 1, -abs(statistic)))
     few = _blocks(column * rest.basis.residual, fitted.problem, STABILITY_BLOCKS)
     weight = _blocks(column**2, fitted.problem, STABILITY_BLOCKS)
     informed = weight > 0.02 * weight.max()

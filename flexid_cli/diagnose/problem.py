@@ -144,6 +144,8 @@ class Problem:
     led : bool
         Without a joint encoder, whether the load's reversals are those of a simulation that the measured motor leads,
         or of the position that the torque shows: the one lacks effects, the other is blurred by noise.
+    trust : sequence of ndarray, optional
+        Further weight of each row, by stretch.
     """
 
     def __init__(
@@ -164,6 +166,7 @@ class Problem:
         stiffening: float = 0.0,
         rigid: bool = False,
         led: bool = False,
+        trust: Sequence[Array] | None = None,
     ) -> None:
         self.stretches, self.noise, self.band_hz = stretches, noise, band_hz
         self.base = replace(base, gear_ratio=gear_ratio)
@@ -175,10 +178,12 @@ class Problem:
         self.rigid, self.led = rigid, led
         self.names = BOTH_NAMES if both else RIGID_NAMES if rigid else ALONE_NAMES
         self.torque_rms = float(np.sqrt(np.mean(np.concatenate([s.torque for s in stretches]) ** 2)))
-        self.weights = [Weights(s.taper, self.spectral(s)) for s in stretches]
+        self.trust = trust
+        each = trust if trust is not None else [None] * len(stretches)
+        self.weights = [Weights(s.taper, self.spectral(s), t) for s, t in zip(stretches, each, strict=True)]
         # Eq. (18) is 1 + X2 s + X1 s^2 times the torque: the likelihood is that of the torque.
         self.level = float(np.mean([w.level - self._passing(w) for w in self.weights]))
-        self.motions = [self._motion(s) for s in stretches]
+        self.motions = [self.motion(s) for s in stretches]
 
     def at(
         self,
@@ -188,6 +193,7 @@ class Problem:
         applied: Mapping[Form, Array] | None = None,
         stiffening: float | None = None,
         led: bool | None = None,
+        trust: Sequence[Array] | None = None,
     ) -> Problem:
         """The same record linearised elsewhere, with other errors of the joint's position taken out."""
         stretches = self.stretches
@@ -209,6 +215,7 @@ class Problem:
             stiffening=self.stiffening if stiffening is None else stiffening,
             rigid=self.rigid,
             led=self.led if led is None else led,
+            trust=self.trust if trust is None else trust,
         )
         other.recorded = self.recorded
         return other
@@ -260,7 +267,8 @@ class Problem:
             motor_only_noise(self.base, self.noise, omega) + floor * (1.0 + passed)[:, None, None]
         )
 
-    def _motion(self, s: Stretch) -> Motion:
+    def motion(self, s: Stretch) -> Motion:
+        """Motion of a stretch at the linearisation."""
         base = self.base
         motor_sign = reversal(s.motor_sharp, base.motor_reversal)
         if self.both:

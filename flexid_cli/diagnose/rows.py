@@ -67,9 +67,11 @@ class Weights:
     taper : Taper
     spectral : ndarray, shape (frequencies, m, m)
         Spectral matrix of the equations' noise, in units of (N m)^2 a sample.
+    trust : ndarray, shape (rows,), optional
+        Further weight of each row that `apply` gives.
     """
 
-    def __init__(self, taper: Taper, spectral: Complex) -> None:
+    def __init__(self, taper: Taper, spectral: Complex, trust: Array | None = None) -> None:
         self.taper = taper
         root = np.linalg.cholesky(spectral)
         self.inverse = np.linalg.inv(root)
@@ -81,6 +83,9 @@ class Weights:
         position = np.arange(self.rows) * (taper.transform / self.rows)
         self.open = np.interp(position, np.arange(taper.samples), taper.window, right=0.0) > 0.5
         self.seconds = position[self.open] / taper.rate_hz
+        self.trust = trust
+        if trust is not None:
+            self.level -= 2.0 * float(np.mean(np.log(trust)))
 
     def apply(self, columns: Sequence[Complex | None]) -> Array:
         """Rows of one or more columns, shape (equations, rows, k); None stands for zeros."""
@@ -98,7 +103,7 @@ class Weights:
                 mixed = part if mixed is None else mixed + part
             if mixed is not None:
                 out[i] = (scale * irfft(mixed, self.rows, axis=0))[self.open]
-        return out
+        return out if self.trust is None else out * self.trust[:, None]
 
     def back(self, rows: Array) -> Array:
         """Transpose of `apply` over the taper: what rows weigh each sample with, shape (equations, n).
@@ -108,7 +113,7 @@ class Weights:
         from scipy.fft import irfft, rfft
 
         spread = np.zeros((self.equations, self.rows))
-        spread[:, self.open] = rows
+        spread[:, self.open] = rows if self.trust is None else rows * self.trust
         Z = rfft(spread, axis=1)
         # The last frequency is real in the rows; the taper leaves nothing there to speak of.
         scale = np.sqrt(self.rows / self.taper.transform) * self.taper.transform / self.rows

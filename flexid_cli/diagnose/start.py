@@ -12,11 +12,14 @@ from flexid_cli.diagnose.basis import solve
 from flexid_cli.diagnose.fitter import Chosen, Fitter
 from flexid_cli.diagnose.problem import SHORTEST_S, SMOOTH_BAND, Problem, Stretch
 from flexid_cli.diagnose.rows import motor_only_noise, two_encoder_noise
+from flexid_cli.diagnose.torque_noise import torque_noise
+from flexid_cli.diagnose.trust import trusted
 from flexid_cli.effects.motion import Base
 from flexid_cli.errors import DataError
 from flexid_cli.estimate.band import torque_band, usable_band
 from flexid_cli.estimate.budget import NoiseLevels, noise_levels
 from flexid_cli.pipeline.columns import reversal
+from flexid_cli.pipeline.spectrum import welch
 from flexid_cli.signals.recording import Recording
 
 if TYPE_CHECKING:
@@ -97,7 +100,7 @@ def first_problems(
     problems = _scanned(problem, fitter) if known is None else [problem.at(known)]
     for one in problems:
         one.anchor, one.settled = one.base, known is not None
-    return [_with_torque_noise(one) for one in problems]
+    return [trusted(_with_torque_noise(one)) for one in problems]
 
 
 def _both_base(stretches: list[Stretch], width: float) -> Base:
@@ -228,31 +231,40 @@ def _scanned(problem: Problem, fitter: Fitter) -> list[Problem]:
 
 
 def _with_torque_noise(problem: Problem) -> Problem:
-    """Raise the torque's noise to what stands in the motor equation just above the band, and continue its fall.
+    """The problem with the torque's noise as the record shows it: a current's noise is seldom white.
 
-    A current's noise is seldom white; that of the encoders is taken off by its known shape.
+    With the motor alone it is what no linear relation explains: what eq. (18) leaves hangs on a stiffness that is not
+    known yet, and the encoder's part hides it. Else it is what the motor equation leaves just above the band.
     """
-    from scipy.signal import welch
-
     s = max(problem.stretches, key=lambda s: s.torque.size)
-    noise = problem.noise
+    found = None
+    if not (problem.both or problem.rigid):
+        found = torque_noise(s.segment, s.rate_hz, problem.band_hz)
+    if found is None:
+        found = _above_the_band(problem, s)
+        if found is not None and found[0] < problem.noise.torque**2:
+            found = problem.noise.torque**2, np.inf
+    if found is None:
+        return problem
+    level, corner = found
+    problem.noise = replace(problem.noise, torque=float(np.sqrt(level)), torque_corner_hz=corner)
+    return problem.at(problem.base)
+
+
+def _above_the_band(problem: Problem, s: Stretch) -> tuple[float, float] | None:
+    """Level and corner of what the motor equation leaves above the band, without the encoders' part."""
     rest = _misfit(problem, s)[100:-100]
-    f, density = welch(rest, fs=s.rate_hz, nperseg=int(min(rest.size, 1024)))
+    f, density = welch(rest, s.rate_hz, int(min(rest.size, 1024)))
     use = (f > ABOVE[0] * problem.band_hz) & (f < min(ABOVE[1] * problem.band_hz, 0.3 * s.rate_hz))
     if np.count_nonzero(use) < LEAST_LINES:
-        return problem
+        return None
     omega = 2.0 * np.pi * f[use]
-    encoders = NoiseLevels(0.0, noise.motor_position, noise.joint_position)
+    encoders = NoiseLevels(0.0, problem.noise.motor_position, problem.noise.joint_position)
     make = two_encoder_noise if problem.both else motor_only_noise
     known = make(problem.base, encoders, omega)[:, 0, 0].real
     b = problem.base
     passed = 1.0 if problem.both else np.abs(1.0 + (1j * b.FV * omega - b.JL * omega**2) / b.K) ** 2
-    left = (density[use] * 0.5 * s.rate_hz - known) / passed
-    level, corner = _first_order(f[use], left)
-    if level < noise.torque**2:
-        level, corner = noise.torque**2, np.inf
-    problem.noise = replace(noise, torque=float(np.sqrt(level)), torque_corner_hz=corner)
-    return problem.at(problem.base)
+    return _first_order(f[use], (density[use] * 0.5 * s.rate_hz - known) / passed)
 
 
 def _first_order(f: Array, density: Array) -> tuple[float, float]:

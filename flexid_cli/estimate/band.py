@@ -15,7 +15,9 @@ from flexid_cli.estimate.least_squares import solve
 from flexid_cli.models.two_encoders import TwoEncoders
 from flexid_cli.pipeline.chain import MIN_ROWS, Chain, ChainSettings
 from flexid_cli.pipeline.columns import Columns
+from flexid_cli.pipeline.spectrum import welch
 from flexid_cli.pipeline.tuning import DECIMATION_EDGE, tune_filter
+from flexid_cli.threads import side_by_side
 
 if TYPE_CHECKING:
     from flexid_cli.config.schema import Config
@@ -149,8 +151,6 @@ def _lowpass(
 
 def usable_band(recording: Recording, *, joint: bool) -> float:
     """Highest frequency at which the positions' power is ten times their noise floor, Hz."""
-    from scipy.signal import welch
-
     segment = max(recording.segments, key=lambda s: s.samples)
     rate = recording.sample_rate_hz
     positions = [segment.motor_position]
@@ -159,7 +159,7 @@ def usable_band(recording: Recording, *, joint: bool) -> float:
     edges = []
     for position in positions:
         length = int(min(position.size - 2, max(256, 8 * rate)))
-        frequency, density = welch(np.diff(position, 2), fs=rate, nperseg=length)
+        frequency, density = welch(np.diff(position, 2), rate, length)
         shaped = density / np.maximum((2.0 * np.sin(np.pi * frequency / rate)) ** 4, 1e-30)
         floor = np.median(shaped[frequency > 0.3 * rate])
         above = frequency[1:][shaped[1:] > SIGNAL_TO_NOISE * floor]
@@ -171,12 +171,10 @@ def usable_band(recording: Recording, *, joint: bool) -> float:
 
 def torque_band(recording: Recording) -> float:
     """Frequency below which 99.9 % of the torque's power about its mean lies, Hz."""
-    from scipy.signal import welch
-
     segment = max(recording.segments, key=lambda s: s.samples)
     rate = recording.sample_rate_hz
     length = int(min(segment.samples, max(256, 8 * rate)))
-    frequency, density = welch(segment.torque - segment.torque.mean(), fs=rate, nperseg=length)
+    frequency, density = welch(segment.torque - segment.torque.mean(), rate, length)
     share = np.cumsum(density) / np.sum(density)
     return float(frequency[min(int(np.searchsorted(share, TORQUE_POWER)), frequency.size - 1)])
 
@@ -191,16 +189,19 @@ def find_resonance(recording: Recording, gravity_m_per_s2: float) -> float | Non
     rate = recording.sample_rate_hz
     longest = max(s.samples for s in recording.segments) / rate
     band = max(4.0 * MIN_ROWS / longest, 0.2)
-    best: tuple[float, float] | None = None
     highest = min(MAX_BAND_OVER_RATE * rate, usable_band(recording, joint=recording.has_joint_position))
+    bands = []
     while band <= highest:
-        found = _resonance_at(recording, band, solver, gravity_m_per_s2)
+        bands.append(band)
+        band *= SCAN_STEP
+    best: tuple[float, float] | None = None
+    results = side_by_side(lambda b: _resonance_at(recording, b, solver, gravity_m_per_s2), bands)
+    for band, found in zip(bands, results, strict=True):
         if found is not None:
             resonance, uncertainty = found
             inside = SCAN_RANGE[0] < resonance / band < SCAN_RANGE[1]
             if inside and uncertainty < SCAN_MAX_RELATIVE_STDERR and (best is None or uncertainty < best[1]):
                 best = (resonance, uncertainty)
-        band *= SCAN_STEP
     return best[0] if best else None
 
 

@@ -17,6 +17,7 @@ from flexid_cli.estimate.covariance import robust_covariance
 from flexid_cli.estimate.fit import FitResult
 from flexid_cli.models.base import Block, Model
 from flexid_cli.pipeline.columns import Columns
+from flexid_cli.pipeline.spectrum import welch
 from flexid_cli.signals.recording import Recording, Segment
 
 Array = NDArray[np.float64]
@@ -79,11 +80,9 @@ def noise_levels(recording: Recording) -> NoiseLevels:
 
 def _floor(x: Array) -> float:
     """Standard deviation of white noise with the median density of the upper band."""
-    from scipy.signal import welch
-
     length = min(1024, x.size - 2)
     # The second difference flattens the steep spectrum of a motion, whose leakage would hide the floor.
-    frequency, density = welch(np.diff(x, 2), fs=1.0, nperseg=length, window="hann")
+    frequency, density = welch(np.diff(x, 2), 1.0, length)
     gain = (2.0 * np.sin(np.pi * frequency)) ** 4
     use = (frequency > 0.5 * NOISE_BAND[0]) & (frequency < 0.5 * NOISE_BAND[1])
     return float(np.sqrt(np.median(density[use] / gain[use]) * 0.5))

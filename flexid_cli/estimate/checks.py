@@ -43,7 +43,7 @@ def solution_tests(solution: Solution) -> dict[str, dict[str, Any]]:
 
 def stiffness_profile(solution: Solution, stderr: float, level: float) -> dict[str, Any]:
     """Profile interval of K with the total standard error, beside the symmetric one that is reported."""
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
     result = solution.result
     symbols = [p.symbol for p in solution.model.parameters]
@@ -52,7 +52,7 @@ def stiffness_profile(solution: Solution, stderr: float, level: float) -> dict[s
     moments = () if solution.correction is None else solution.correction.moments
     none = tuple(np.zeros((M.shape[1], M.shape[1])) for M in solution.matrices)
     cross = corrected.products(solution.matrices, Z, moments or none, result.weights)
-    half = float(norm.ppf(0.5 + 0.5 * level)) * stderr
+    half = float(ndtri(0.5 + 0.5 * level)) * stderr
     low, high = profile_interval(solution.model, cross, result.theta, result.stderr, index, half)
     return {
         "low": low,
@@ -80,7 +80,7 @@ def endogeneity(solution: Solution, indices: Sequence[int]) -> dict[str, Any]:
     The difference of the two estimates of Jm, K and JL, in its own robust covariance (that of the difference of
     their influences, so that it holds for correlated residuals).
     """
-    from scipy.stats import f as f_distribution
+    from scipy.special import fdtrc
 
     from flexid_cli.estimate.fit import fit
 
@@ -106,14 +106,14 @@ def endogeneity(solution: Solution, indices: Sequence[int]) -> dict[str, Any]:
     return {
         "statistic": statistic,
         "restrictions": int(pick.size),
-        "p_value": float(f_distribution.sf(scaled, pick.size, remaining)),
+        "p_value": float(fdtrc(pick.size, remaining, max(scaled, 0.0))),
         "meaning": "a small p value: noise in the columns biases plain least squares, which is why it was not taken",
     }
 
 
 def whiteness(residual: Array, lengths: Sequence[int]) -> dict[str, Any]:
     """Ljung and Box on the rows of the torque's residual, and the rows that are worth an independent one."""
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     lags = min(LAGS, max(1, min(lengths) // 4))
     rho = autocorrelation(residual, lengths, lags)
@@ -124,7 +124,7 @@ def whiteness(residual: Array, lengths: Sequence[int]) -> dict[str, Any]:
     return {
         "statistic": statistic,
         "lags": lags,
-        "p_value": float(chi2.sf(statistic, lags)),
+        "p_value": float(chdtrc(lags, max(statistic, 0.0))),
         "first_autocorrelation": float(rho[0]),
         "rows": int(n),
         "effective_rows": float(n / max(1.0 + 2.0 * float(np.sum(used)), 1.0 / n)),
@@ -147,7 +147,7 @@ def input_correlation(residual: Array, predicted: Array, lengths: Sequence[int])
     Two independent series correlate with the variance sum_k rho_e(k) rho_u(k) / n (Bartlett 1935); the p value is
     Bonferroni's over the lags.
     """
-    from scipy.stats import norm
+    from scipy.special import ndtr
 
     lags = min(LAGS, max(1, min(lengths) // 4))
     e, u = residual - residual.mean(), predicted - predicted.mean()
@@ -170,7 +170,7 @@ def input_correlation(residual: Array, predicted: Array, lengths: Sequence[int])
         "statistic": statistic,
         "correlation": float(found[worst]),
         "lag_rows": worst - lags,
-        "p_value": min(1.0, float(2.0 * norm.sf(statistic)) * (2 * lags + 1)),
+        "p_value": min(1.0, 2.0 * float(ndtr(-statistic)) * (2 * lags + 1)),
         "meaning": "a small p value: the torque explains a part of the residual that the model leaves out",
     }
 
@@ -185,7 +185,7 @@ def stability(
     influence's own variance that has passed, for a sweep does not inform on a parameter evenly. Bonferroni over the
     parameters.
     """
-    from scipy.stats import kstwobign
+    from scipy.special import kolmogorov
 
     parts = influence(result)[:, list(indices)]
     parts = parts - parts.mean(axis=0)
@@ -200,6 +200,6 @@ def stability(
         "statistic": float(peaks[worst]),
         "parameter": symbols[worst],
         "row": int(np.argmax(np.abs(bridge[:, worst]))),
-        "p_value": min(1.0, float(kstwobign.sf(peaks[worst])) * len(indices)),
+        "p_value": min(1.0, float(kolmogorov(peaks[worst])) * len(indices)),
         "meaning": "a small p value: the parameter is not the same throughout the record",
     }

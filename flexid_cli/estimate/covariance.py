@@ -145,28 +145,34 @@ def _stationary(
 ) -> Array:
     """Covariance B Z' G Z B' with bread B and the residuals' autocovariances G.
 
-    Parzen's lag window makes G a covariance.
+    Parzen's lag window makes G a covariance. Its products are convolutions.
     """
+    from scipy.fft import irfft, next_fast_len, rfft
+
     rows, parameters = residuals.size // blocks, instruments.shape[1]
-    e = (residuals.reshape(blocks, rows)).T
+    e = residuals.reshape(blocks, rows)
     Z = (instruments @ bread.T).reshape(blocks, rows, parameters)
+    farthest = LAG_FACTOR * np.sqrt(rows)
+    lags = np.arange(min(int(farthest), max(lengths) - 1) + 1)
     spans = [slice(a, b) for a, b in pairwise(accumulate(lengths, initial=0))]
+    sizes = [next_fast_len(s.stop - s.start + lags.size, real=True) for s in spans]
+    gamma = np.zeros((blocks, blocks, lags.size))
+    for s, n in zip(spans, sizes, strict=True):
+        E = rfft(e[:, s], n)
+        gamma += irfft(E[:, None] * E.conj(), n)[..., : lags.size] / rows
+    # Lags of either sign are each other's transpose: one half is enough, with half of lag zero.
+    half = gamma * _parzen(lags / farthest)
+    half[..., 0] *= 0.5
     total = np.zeros((parameters, parameters))
-    for lag in range(min(int(LAG_FACTOR * np.sqrt(rows)), max(lengths) - 1) + 1):
-        window = _parzen(lag / (LAG_FACTOR * np.sqrt(rows)))
-        pairs = [e[s][lag:].T @ e[s][: max(s.stop - s.start - lag, 0)] for s in spans]
-        gamma = np.sum(pairs, axis=0) / rows
-        part = np.zeros((parameters, parameters))
-        for a in range(blocks):
-            for b in range(blocks):
-                cross = sum(Z[a, s][lag:].T @ Z[b, s][: max(s.stop - s.start - lag, 0)] for s in spans)
-                part += gamma[a, b] * cross
-        total += window * (part if lag == 0 else part + part.T)
-    return np.asarray(total * rows / max(rows - parameters, 1), dtype=np.float64)
+    for s, n in zip(spans, sizes, strict=True):
+        spectrum = np.einsum("abf,bfp->afp", rfft(half, n), rfft(Z[:, s], n, axis=1))
+        smoothed = irfft(spectrum, n, axis=1)[:, : s.stop - s.start]
+        total += np.tensordot(Z[:, s], smoothed, ((0, 1), (0, 1)))
+    return np.asarray((total + total.T) * rows / max(rows - parameters, 1), dtype=np.float64)
 
 
-def _parzen(x: float) -> float:
-    return 1.0 - 6.0 * x**2 * (1.0 - x) if x <= 0.5 else 2.0 * max(1.0 - x, 0.0) ** 3
+def _parzen(x: Array) -> Array:
+    return np.where(x <= 0.5, 1.0 - 6.0 * x**2 * (1.0 - x), 2.0 * np.maximum(1.0 - x, 0.0) ** 3)
 
 
 def _cosine_sums(x: Array, count: int) -> Array:

@@ -247,7 +247,7 @@ class _Tested:
 
     def joint(self, fixed: Sequence[int]) -> tuple[float, float]:
         """F that all of these are zero, and its p value."""
-        from scipy.stats import f as f_distribution
+        from scipy.special import fdtrc
 
         pick, count = list(fixed), len(fixed)
         theta = self.result.theta[pick]
@@ -256,7 +256,7 @@ class _Tested:
         # A robust covariance has an error in every direction (Hotelling); the textbook's only one, of its scale.
         remaining = max(series - count + 1.0, 1.0) if self.robust else series
         statistic = wald / count * remaining / series
-        return statistic, float(f_distribution.sf(statistic, count, remaining))
+        return statistic, float(fdtrc(count, remaining, max(statistic, 0.0)))
 
 
 def _matters(solution: Solution, refitted: Solution | None, p_value: float, level: float) -> str:

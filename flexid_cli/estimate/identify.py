@@ -22,6 +22,7 @@ from flexid_cli.models.rigid import Rigid
 from flexid_cli.models.two_encoders import TOTAL, TwoEncoders, TwoEncodersStructured
 from flexid_cli.pipeline.chain import Chain
 from flexid_cli.pipeline.columns import Columns
+from flexid_cli.threads import side_by_side
 
 if TYPE_CHECKING:
     from flexid_cli.config.schema import Config
@@ -63,13 +64,9 @@ def identify(recording: Recording, config: Config) -> Identification:
     f1 = None
     if flexible and config.axis.f1_hz is None:
         f1 = band.find_resonance(recording, config.axis.gravity_m_per_s2)
-    models: list[ModelResult] = []
-    skipped: list[Skipped] = []
-    for model_id in ids:
-        try:
-            models.append(_solve(recording, config, model_id, f1))
-        except DataError as error:
-            skipped.append(Skipped(model_id, str(error.message) + (f" ({error.hint})" if error.hint else "")))
+    results = side_by_side(lambda model_id: _solved(recording, config, model_id, f1), ids)
+    models = [found for found in results if isinstance(found, ModelResult)]
+    skipped = [found for found in results if isinstance(found, Skipped)]
     if config.models is None and not models and "rigid" not in ids:
         models.append(_solve(recording, config, "rigid", None))
     if not models:
@@ -95,6 +92,13 @@ def model_ids(recording: Recording, config: Config) -> tuple[str, ...]:
             "add signals.joint_position, or take `two_encoders` out of `models`",
         )
     return tuple(ids)
+
+
+def _solved(recording: Recording, config: Config, model_id: str, f1: float | None) -> ModelResult | Skipped:
+    try:
+        return _solve(recording, config, model_id, f1)
+    except DataError as error:
+        return Skipped(model_id, str(error.message) + (f" ({error.hint})" if error.hint else ""))
 
 
 def _solve(recording: Recording, config: Config, model_id: str, f1: float | None) -> ModelResult:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.pipeline.chain import Chain
+from flexid_cli.pipeline.spectrum import welch
 from flexid_cli.signals.recording import Recording
 
 Array = NDArray[np.float64]
@@ -59,11 +60,9 @@ def floors(recording: Recording) -> Floors:
 
 def _floor(x: Array) -> tuple[float, float]:
     """Standard deviation a sample of white noise with the median density, and the doubt about its square."""
-    from scipy.signal import welch
-
     length = min(1024, x.size - 2)
     # The second difference flattens the steep spectrum of a motion, whose leakage would hide the floor.
-    frequency, density = welch(np.diff(x, 2), fs=1.0, nperseg=length, window="hann")
+    frequency, density = welch(np.diff(x, 2), 1.0, length)
     gain = (2.0 * np.sin(np.pi * frequency)) ** 4
     levels = []
     for low, high in (LOW_PART, HIGH_PART):

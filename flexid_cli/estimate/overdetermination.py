@@ -65,7 +65,7 @@ def regression(
 
 def _wald(solution: Solution, free: Array, covariance: Array, series: float) -> dict[str, Any]:
     """Distance of the free coefficients from the restricted ones, minimised over the parameters."""
-    from scipy.stats import f as f_distribution
+    from scipy.special import fdtrc
 
     signs = np.concatenate([_SIGNS, np.ones(free.size - 7)])
     model, theta = solution.model, solution.result.theta
@@ -87,6 +87,6 @@ def _wald(solution: Solution, free: Array, covariance: Array, series: float) -> 
         "statistic": statistic,
         "scaled_statistic": scaled,
         "restrictions": restrictions,
-        "p_value": float(f_distribution.sf(scaled, restrictions, remaining)),
+        "p_value": float(fdtrc(restrictions, remaining, max(scaled, 0.0))),
         "meaning": "a small p value: distortion, noise in the columns or missing physics bias the coefficients",
     }

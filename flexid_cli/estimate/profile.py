@@ -50,20 +50,20 @@ def profile_interval(
     tuple of float or None
         Low and high bound; None where there is none within eight half widths.
     """
-
     unit = _variance(model, products, theta, index)
 
-    def excess(distance: float, sign: float) -> float:
-        return abs(_remaining_step(model, products, theta, stderr, index, sign * distance, unit)) - half_width
+    def bound(sign: float) -> float | None:
+        def excess(distance: float) -> float:
+            held = sign * distance
+            return abs(_remaining_step(model, products, theta, stderr, index, held, unit)) - half_width
 
-    bounds: list[float | None] = []
-    for sign in (-1.0, 1.0):
         try:
-            distance = _crossing(lambda d, sign=sign: excess(d, sign), half_width)
+            distance = _crossing(excess, half_width)
         except ArithmeticError:
-            distance = None
-        bounds.append(None if distance is None else float(theta[index] + sign * distance))
-    return bounds[0], bounds[1]
+            return None
+        return None if distance is None else float(theta[index] + sign * distance)
+
+    return bound(-1.0), bound(1.0)
 
 
 def _crossing(excess: Callable[[float], float], half_width: float) -> float | None:

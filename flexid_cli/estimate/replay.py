@@ -38,6 +38,7 @@ from flexid_cli.estimate.summary import Uncertainty
 from flexid_cli.models.base import Model
 from flexid_cli.pipeline import derivatives, filters
 from flexid_cli.pipeline.columns import Columns, reversal
+from flexid_cli.pipeline.spectrum import welch
 from flexid_cli.signals.recording import Recording, Segment
 
 Array = NDArray[np.float64]
@@ -276,8 +277,6 @@ def _torque_noise(
     a motion takes: its expected density is taken off. The floor of the torque's own spectrum says nothing of it: what
     the controller makes of the encoders' noise is torque that moves the motor.
     """
-    from scipy.signal import welch
-
     longest = max(range(len(torques)), key=lambda i: torques[i].size)
     remainder = columns.segments[longest].torque - torques[longest]
     # The real load need not start at rest; its free oscillation is no noise.
@@ -288,7 +287,7 @@ def _torque_noise(
     edge = min(int(rate / columns.chain.band_hz), remainder.size // 8)
     inner = remainder[edge : remainder.size - edge]
     length = min(inner.size, max(MIN_SPECTRUM, inner.size // SPECTRUM_PARTS))
-    frequency, density = welch(inner, fs=1.0, nperseg=length, window="hann")
+    frequency, density = welch(inner, 1.0, length)
     shaped = 2.0 * levels.sigma[1] ** 2 * _encoder_gain(columns, axis, frequency * rate)
     return frequency, np.maximum(_averaged(density - shaped), 0.0)
 
@@ -367,9 +366,9 @@ def _budget(
 
 def _clear(count: int) -> float:
     """Monte Carlo errors beyond which a mean of ``count`` replays is no chance: 3, wider where few tell the error."""
-    from scipy.stats import norm, t
+    from scipy.special import ndtr, stdtrit
 
-    return float(t.isf(norm.sf(CLEAR_SIGMAS), count - 1))
+    return -float(stdtrit(count - 1, ndtr(-CLEAR_SIGMAS)))
 
 
 def _largest(parameters: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

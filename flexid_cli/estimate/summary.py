@@ -17,6 +17,7 @@ from flexid_cli.estimate.result import Estimate, Fit, ModelResult, Spectrum, Tra
 from flexid_cli.estimate.solution import Solution
 from flexid_cli.estimate.verdict import correlated_with, demoted, judge, model_doubt, undetermined
 from flexid_cli.models.base import Model, Parameter, unit_of
+from flexid_cli.pipeline.spectrum import welch
 
 if TYPE_CHECKING:
     from flexid_cli.config.schema import Config
@@ -431,11 +432,9 @@ def _trace(solution: Solution) -> Trace:
 
 def torque_spectrum(recording: Recording) -> Spectrum:
     """Spectrum of the unfiltered torque of the longest segment."""
-    from scipy.signal import welch
-
     segment = max(recording.segments, key=lambda s: s.samples)
     length = int(min(segment.samples, max(256, SPECTRUM_SEGMENT_S * recording.sample_rate_hz)))
-    frequency, density = welch(segment.torque, fs=recording.sample_rate_hz, nperseg=length)
+    frequency, density = welch(segment.torque, recording.sample_rate_hz, length)
     return Spectrum(frequency[1:], np.sqrt(density[1:]), f"{recording.torque_unit}/sqrt(Hz)")
 
 

@@ -52,9 +52,9 @@ def judge(
     """
     if not (np.isfinite(value) and np.isfinite(stderr)):
         return undetermined(parameter, unit, doubt or "the columns of the record do not determine it")
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
-    half = float(t.ppf(0.5 + 0.5 * level, max(degrees_of_freedom, 1.0))) * stderr
+    half = float(stdtrit(max(degrees_of_freedom, 1.0), 0.5 + 0.5 * level)) * stderr
     interval = Interval(value - half, value + half, level, method)
     relative = 100.0 * stderr / abs(value) if value else None
     verdict, reason = _verdict(parameter, value, interval, relative, doubt)

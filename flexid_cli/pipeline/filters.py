@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 # Nyquist rate.
 DECIMATION_ORDER = 8
 DECIMATION_RIPPLE_DB = 0.05
+# A pole is real if its imaginary part is rounding.
+REAL_POLE = 1e-12
 
 
 def butterworth(order: int, cutoff_hz: float, sample_rate_hz: float) -> Array:
@@ -39,9 +41,8 @@ def butterworth(order: int, cutoff_hz: float, sample_rate_hz: float) -> Array:
 
 @lru_cache(maxsize=64)
 def _butterworth(order: int, cutoff_hz: float, sample_rate_hz: float) -> Array:
-    from scipy.signal import butter
-
-    return np.asarray(butter(order, cutoff_hz, fs=sample_rate_hz, output="sos"), dtype=np.float64)
+    angle = 0.5 * np.pi * (np.arange(1, 2 * order, 2) / order + 1.0)
+    return _sections(np.exp(1j * angle), cutoff_hz / sample_rate_hz)
 
 
 def decimation_filter(factor: int) -> Array:
@@ -51,12 +52,37 @@ def decimation_filter(factor: int) -> Array:
 
 @lru_cache(maxsize=64)
 def _decimation_filter(factor: int) -> Array:
-    from scipy.signal import cheby1
-
     if factor == 1:
         return np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
-    edge = DECIMATION_EDGE / factor
-    return np.asarray(cheby1(DECIMATION_ORDER, DECIMATION_RIPPLE_DB, edge, output="sos"), dtype=np.float64)
+    ripple = 10.0 ** (DECIMATION_RIPPLE_DB / 10.0)
+    width = np.arcsinh(1.0 / np.sqrt(ripple - 1.0)) / DECIMATION_ORDER
+    angle = 0.5 * np.pi * np.arange(1 - DECIMATION_ORDER, DECIMATION_ORDER, 2) / DECIMATION_ORDER
+    sos = _sections(-np.sinh(width + 1j * angle), 0.5 * DECIMATION_EDGE / factor)
+    # An even order ripples down from one, and its gain at rest is the lowest.
+    sos[0, :3] /= np.sqrt(ripple)
+    return sos
+
+
+def _sections(prototype: NDArray[np.complex128], cutoff: float) -> Array:
+    """Sections of a low pass, each with gain one at rest, by the bilinear transform of an analog prototype.
+
+    Parameters
+    ----------
+    prototype : ndarray, shape (order,)
+        Poles of the analog low pass with cutoff 1 rad/s; it has no zeros.
+    cutoff : float
+        Cutoff over the sampling rate; there the digital filter is as the prototype at 1 rad/s.
+    """
+    analog = np.tan(np.pi * cutoff) * prototype
+    poles = (1.0 + analog) / (1.0 - analog)
+    pairs = [np.array([1.0, -2.0 * p.real, abs(p) ** 2]) for p in poles if p.imag > REAL_POLE]
+    single = [np.array([1.0, -p.real, 0.0]) for p in poles if abs(p.imag) <= REAL_POLE]
+    # Sections that ring most come last, behind those that damp.
+    ordered = sorted(single + pairs, key=lambda a: a[2])
+    zeros = [np.array([1.0, 1.0, 0.0]) if a[2] == 0.0 else np.array([1.0, 2.0, 1.0]) for a in ordered]
+    return np.array(
+        [np.concatenate([b * (a.sum() / b.sum()), a]) for b, a in zip(zeros, ordered, strict=True)]
+    )
 
 
 def zero_phase(x: Array, sos: Array, *, settled_edges: bool = True) -> Array:
@@ -100,17 +126,21 @@ def _both_ways(x: Array, sos: Array, rest: Array) -> Array:
 
 @lru_cache(maxsize=64)
 def _rest_state(sections: bytes, count: int) -> Array:
-    """State of each section after a long constant input of one; solving for it costs as much as filtering."""
-    from scipy.signal import sosfilt_zi
-
-    return np.asarray(sosfilt_zi(np.frombuffer(sections).reshape(count, 6).copy()), dtype=np.float64)
+    """State of each section after a long constant input of one, shape (sections, 2)."""
+    states, level = [], 1.0
+    for b0, b1, b2, _, a1, a2 in np.frombuffer(sections).reshape(count, 6):
+        out = level * (b0 + b1 + b2) / (1.0 + a1 + a2)
+        last = b2 * level - a2 * out
+        states.append([b1 * level - a1 * out + last, last])
+        level = out
+    return np.array(states)
 
 
 def magnitude(sos: Array, frequency_hz: Array, sample_rate_hz: float) -> Array:
     """Forward-backward magnitude of ``sos`` at the given frequencies."""
-    from scipy.signal import freqz_sos
-
-    _, response = freqz_sos(sos, worN=2.0 * np.pi * frequency_hz / sample_rate_hz)
+    delay = np.exp(-2j * np.pi * frequency_hz / sample_rate_hz)
+    powers = np.stack([np.ones_like(delay), delay, delay**2])
+    response = np.prod((sos[:, :3] @ powers) / (sos[:, 3:] @ powers), axis=0)
     return np.asarray(np.abs(response) ** 2, dtype=np.float64)
 
 

@@ -21,6 +21,7 @@ STOP_DB = 80.0
 LOWPASS_FROM = 1.1
 SPLINE_BAND = 0.15
 NEAREST_STEP = 0.1
+SHORTEST_BLOCK = 1024
 
 
 @dataclass(frozen=True)
@@ -161,15 +162,41 @@ def _refine(values: Array, pass_edge: float, stop_edge: float) -> tuple[Array, i
     fine : ndarray, shape ((n - 1) * up + 1,)
     up, taps : int
     """
-    from scipy.signal import firwin, kaiserord, oaconvolve, upfirdn
-
     up = max(1, math.ceil(pass_edge / SPLINE_BAND))
-    taps, beta = kaiserord(STOP_DB + 2.0, 2.0 * (stop_edge - pass_edge) / up)
-    taps += 1 - taps % 2
-    window = up * firwin(taps, (pass_edge + stop_edge) / up, window=("kaiser", beta))
-    half = taps // 2
+    window = up * _kaiser_lowpass((pass_edge + stop_edge) / up, 2.0 * (stop_edge - pass_edge) / up)
+    half = window.size // 2
     reach = -(-half // up)
     padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
-    fine = oaconvolve(padded, window) if up == 1 else upfirdn(window, padded, up=up)
+    fine = np.empty((padded.size - 1) * up + window.size)
+    for phase in range(up):
+        part = _convolve(padded, window[phase::up])
+        fine[phase::up] = part[: fine[phase::up].size]
     first = reach * up + half
-    return fine[first : first + (values.size - 1) * up + 1], up, taps
+    return fine[first : first + (values.size - 1) * up + 1], up, window.size
+
+
+def _kaiser_lowpass(cutoff: float, width: float) -> Array:
+    """Impulse response of gain one at rest; cutoff and width of the transition over the Nyquist frequency.
+
+    Kaiser's formulae for length and window: Oppenheim and Schafer, "Discrete-Time Signal Processing", 7.5.
+    """
+    attenuation = STOP_DB + 2.0
+    taps = math.ceil((attenuation - 7.95) / (2.285 * math.pi * width) + 1.0)
+    taps += 1 - taps % 2
+    index = np.arange(taps) - taps // 2
+    window = np.sinc(cutoff * index) * np.kaiser(taps, 0.1102 * (attenuation - 8.7))
+    return np.asarray(window / window.sum())
+
+
+def _convolve(x: Array, window: Array) -> Array:
+    """Full convolution with a short window, block by block (overlap and add)."""
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    size = next_fast_len(max(8 * window.size, SHORTEST_BLOCK), real=True)
+    step = size - window.size + 1
+    spectrum = rfft(window, size)
+    out = np.zeros(x.size + window.size - 1)
+    for start in range(0, x.size, step):
+        part = irfft(spectrum * rfft(x[start : start + step], size), size)
+        out[start : start + size] += part[: out.size - start]
+    return out

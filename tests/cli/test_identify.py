@@ -309,6 +309,29 @@ def command(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-m", "flexid_cli", "identify", *map(str, arguments)]
 
 
+def test_the_slowest_imports_are_not_needed(log: Path, config: Path) -> None:
+    code = (
+        "import sys\n"
+        "from flexid_cli.cli.main import main\n"
+        "try:\n    main(sys.argv[1:])\n"
+        "except SystemExit as end:\n    assert not end.code\n"
+        "sys.exit(' '.join({'scipy.signal', 'scipy.stats', 'matplotlib'} & set(sys.modules)) or 0)\n"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "identify",
+        str(log),
+        "--config",
+        str(config),
+        "--essential",
+        "-qq",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_outputs_are_whole_and_the_same_in_another_process(log: Path, config: Path, tmp_path: Path) -> None:
     """There with an encoding that lacks the table's lines, and with other hashes of words."""
     here, there = tmp_path / "here", tmp_path / "there"

@@ -10,6 +10,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom, t
 
+from flexid_cli.estimate import covariance as covariance_module
 from flexid_cli.estimate.covariance import robust_covariance, series_length
 
 Array = np.ndarray
@@ -295,3 +296,36 @@ def test_the_number_of_cosines_follows_the_rule_of_its_authors():
     assert series_length(2, 1) == 1
     scores = np.random.default_rng(18).standard_normal((40, 9))
     assert np.linalg.matrix_rank(robust_covariance(scores, np.eye(9), (40,)).covariance) == 9
+
+
+@pytest.mark.parametrize("lengths", [(300,), (200, 80, 20), (1, 60), (25,)])
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_stationary_covariance_is_the_sum_over_the_lags(lengths: tuple[int, ...], blocks: int):
+    rows, rng = sum(lengths), np.random.default_rng(3)
+    Z = rng.standard_normal((blocks * rows, 4))
+    e = np.cumsum(rng.standard_normal(blocks * rows)) / 5.0
+    found = covariance_module._stationary(Z, e, np.eye(4), blocks, lengths)
+    # Every pair of rows of one segment, with the window and the autocovariance of its lag.
+    segment = np.repeat(np.arange(len(lengths)), lengths)
+    lag = np.arange(rows)[:, None] - np.arange(rows)
+    same = segment[:, None] == segment
+    width = covariance_module.LAG_FACTOR * np.sqrt(rows)
+    reach = min(int(width), max(lengths) - 1)
+    residuals = e.reshape(blocks, rows)
+    total = np.zeros((4, 4))
+    for a in range(blocks):
+        for b in range(blocks):
+            products = np.outer(residuals[a], residuals[b])
+            gamma = {k: products[same & (lag == k)].sum() / rows for k in range(-reach, reach + 1)}
+            window = {k: float(covariance_module._parzen(np.array(abs(k) / width))) for k in gamma}
+            G = sum(window[k] * gamma[k] * (same & (lag == k)) for k in gamma)
+            total += Z[a * rows : (a + 1) * rows].T @ G @ Z[b * rows : (b + 1) * rows]
+    np.testing.assert_allclose(found, total * rows / (rows - 4), rtol=1e-9, atol=1e-9 * np.abs(total).max())
+
+
+@pytest.mark.parametrize(("rows", "count"), [(50, 12), (50, 98), (3, 4), (1, 2)])
+def test_cosine_sums_are_those_of_the_cosines(rows: int, count: int):
+    x = np.random.default_rng(4).standard_normal((rows, 3))
+    t = (np.arange(rows) + 0.5) / rows
+    cosines = np.cos(np.pi * np.outer(np.arange(count + 1), t))
+    np.testing.assert_allclose(covariance_module._cosine_sums(x, count), cosines @ x, atol=1e-12)

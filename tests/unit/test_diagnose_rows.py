@@ -57,20 +57,26 @@ def smooth(seed: int) -> np.ndarray:
     return np.asarray(rng.standard_normal(12) @ np.array(waves))
 
 
+@pytest.mark.parametrize("trusted_less", [False, True])
 @pytest.mark.parametrize("equations", [1, 2])
-def test_back_is_the_transpose_of_apply_over_the_taper(equations):
+def test_back_is_the_transpose_of_apply_over_the_taper(equations, trusted_less):
     rng = np.random.default_rng(3)
     taper = Taper.of(SAMPLES, RATE, BAND, 48)
     root = rng.standard_normal((equations, equations)) + 1j * rng.standard_normal((equations, equations))
     ramp = 1.0 + taper.frequency_hz / BAND
     spectral = (root @ root.conj().T + 2.0 * np.eye(equations)) * ramp[:, None, None]
     spectral = spectral.real.astype(np.complex128)
-    weights = Weights(taper, spectral)
+    plain = Weights(taper, spectral)
+    trust = rng.uniform(0.1, 1.0, int(plain.open.sum()))
+    weights = Weights(taper, spectral, trust) if trusted_less else plain
     columns = [smooth(k) for k in range(equations)]
     rows = weights.apply([taper.spectrum(c[:, None]) for c in columns])[:, :, 0]
     other = rng.standard_normal(rows.shape)
     forth = float(np.sum(rows * other))
     back = float(np.sum(np.array(columns) * weights.back(other)))
+    # Rows that count less are those of a larger noise: the likelihood's level says so.
+    expected = -2.0 * np.mean(np.log(trust)) if trusted_less else 0.0
+    assert weights.level - plain.level == pytest.approx(expected)
     assert back == pytest.approx(forth, abs=1e-5 * np.linalg.norm(rows) * np.linalg.norm(other))
 
 

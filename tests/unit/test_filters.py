@@ -40,6 +40,34 @@ def test_butterworth_as_the_paper_used_it():
     assert pytest.approx(0.808, abs=5e-4) == 1.0 / (1.0 + (147.03 / 176.0) ** 8)
 
 
+@pytest.mark.parametrize("order", range(1, 11))
+@pytest.mark.parametrize("share", [0.001, 0.03, 0.3, 0.49])
+def test_butterworth_is_the_design_of_scipy(order: int, share: float):
+    ours = filters.butterworth(order, share * RATE, RATE)
+    theirs = signal.butter(order, share * RATE, fs=RATE, output="sos")
+    assert ours.shape == theirs.shape
+    frequency = np.linspace(0.0, 0.499 * RATE, 300)
+    _, response = signal.freqz_sos(theirs, 2.0 * np.pi * frequency / RATE)
+    np.testing.assert_allclose(filters.magnitude(ours, frequency, RATE), np.abs(response) ** 2, atol=1e-10)
+
+
+@pytest.mark.parametrize("order", range(1, 9))
+@pytest.mark.parametrize("samples", [1, 2, 7, 999])
+def test_the_compiled_sections_give_the_bits_of_sosfilt(order: int, samples: int):
+    sos = filters.butterworth(order, 0.1 * RATE, RATE)
+    x = 1e3 * np.random.default_rng(order).standard_normal(samples)
+    forward = signal.sosfilt(sos, x)
+    expected = signal.sosfilt(sos, forward[::-1])[::-1]
+    np.testing.assert_array_equal(filters.zero_phase(x, sos, settled_edges=False), expected)
+
+
+@pytest.mark.parametrize("order", range(1, 9))
+def test_the_state_of_rest_is_that_of_scipy(order: int):
+    sos = filters.butterworth(order, 0.05 * RATE, RATE)
+    ours = filters._rest_state(sos.tobytes(), sos.shape[0])
+    np.testing.assert_allclose(ours, signal.sosfilt_zi(sos), rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("cutoff", [0.0, -1.0, 0.5 * RATE, 400.0])
 def test_a_cutoff_outside_the_band_is_refused_with_a_cure(cutoff: float):
     with pytest.raises(UsageError) as caught:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import signal
 
+from flexid_cli.signals import resample as resample_module
 from flexid_cli.signals.resample import resample
 from flexid_cli.signals.timebase import Track, build_timelines, make_track
 
@@ -123,3 +125,17 @@ def test_few_samples(samples):
     grid = stamps[:-1] + 250_000.0
     result = resample(track_of(stamps, stamps / NS), grid, 1e6)
     assert result.values == pytest.approx(grid / NS, abs=1e-6)
+
+
+@pytest.mark.parametrize(("cutoff", "width"), [(0.33, 0.13), (0.9, 0.05), (0.02, 0.004)])
+def test_the_low_pass_is_kaisers_of_scipy(cutoff, width):
+    taps, beta = signal.kaiserord(resample_module.STOP_DB + 2.0, width)
+    expected = signal.firwin(taps + 1 - taps % 2, cutoff, window=("kaiser", beta))
+    np.testing.assert_allclose(resample_module._kaiser_lowpass(cutoff, width), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize(("samples", "taps"), [(5, 3), (1, 9), (1100, 33), (5000, 1033), (3000, 1)])
+def test_convolution_by_blocks_is_the_whole_one(samples, taps):
+    rng = np.random.default_rng(samples)
+    x, window = rng.standard_normal(samples), rng.standard_normal(taps)
+    np.testing.assert_allclose(resample_module._convolve(x, window), np.convolve(x, window), atol=1e-11)
