@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
+from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -11,19 +13,39 @@ Result = TypeVar("Result")
 
 
 def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Results of ``function`` in the order of the items; the first error is raised."""
+    """Results of ``function`` in the order of the items; of errors the first item's is raised.
+
+    An interrupt does not wait for the work: its threads die with the process.
+    """
     work = list(items)
     workers = min(len(work), processors())
     if workers < 2:
         return [function(item) for item in work]
-    from concurrent.futures import ThreadPoolExecutor
+    waiting: SimpleQueue[int] = SimpleQueue()
+    for k in range(len(work)):
+        waiting.put(k)
+    results: dict[int, Result] = {}
+    errors: dict[int, BaseException] = {}
 
-    with ThreadPoolExecutor(workers) as pool:
-        try:
-            return list(pool.map(function, work))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    def run() -> None:
+        while not errors:
+            try:
+                k = waiting.get_nowait()
+            except Empty:
+                return
+            try:
+                results[k] = function(work[k])
+            except BaseException as error:  # noqa: BLE001 - raised by the caller's thread
+                errors[k] = error
+
+    threads = [Thread(target=run, daemon=True) for _ in range(workers)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[min(errors)]
+    return [results[k] for k in range(len(work))]
 
 
 def processors() -> int:

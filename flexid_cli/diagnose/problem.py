@@ -145,7 +145,7 @@ class Problem:
         Without a joint encoder, whether the load's reversals are those of a simulation that the measured motor leads,
         or of the position that the torque shows: the one lacks effects, the other is blurred by noise.
     trust : sequence of ndarray, optional
-        Further weight of each row, by stretch.
+        Further weight of each row, shape (equations, rows), by stretch.
     """
 
     def __init__(

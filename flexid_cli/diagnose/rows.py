@@ -67,7 +67,7 @@ class Weights:
     taper : Taper
     spectral : ndarray, shape (frequencies, m, m)
         Spectral matrix of the equations' noise, in units of (N m)^2 a sample.
-    trust : ndarray, shape (rows,), optional
+    trust : ndarray, shape (m, rows), optional
         Further weight of each row that `apply` gives.
     """
 
@@ -103,7 +103,7 @@ class Weights:
                 mixed = part if mixed is None else mixed + part
             if mixed is not None:
                 out[i] = (scale * irfft(mixed, self.rows, axis=0))[self.open]
-        return out if self.trust is None else out * self.trust[:, None]
+        return out if self.trust is None else out * self.trust[:, :, None]
 
     def back(self, rows: Array) -> Array:
         """Transpose of `apply` over the taper: what rows weigh each sample with, shape (equations, n).

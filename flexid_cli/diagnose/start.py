@@ -12,7 +12,7 @@ from flexid_cli.diagnose.basis import solve
 from flexid_cli.diagnose.fitter import Chosen, Fitter
 from flexid_cli.diagnose.problem import SHORTEST_S, SMOOTH_BAND, Problem, Stretch
 from flexid_cli.diagnose.rows import motor_only_noise, two_encoder_noise
-from flexid_cli.diagnose.torque_noise import torque_noise
+from flexid_cli.diagnose.torque_noise import ABOVE, HIGHEST, MOST_FALL, torque_noise
 from flexid_cli.diagnose.trust import trusted
 from flexid_cli.effects.motion import Base
 from flexid_cli.errors import DataError
@@ -34,8 +34,7 @@ SAME_MINIMUM = 0.25  # of the stiffness's logarithm
 MOST_STARTS = 6
 RIGID = 100.0  # times the band: a resonance that is nowhere in it
 SCANNED_WITH = ("torque_offset", "gravity", "joint_damping", "load_dependent_friction", "viscous_nonlinear")
-# Where the torque's noise is looked for: times the band, least lines, and how far it is taken to rise below.
-ABOVE, LEAST_LINES, MOST_FALL = (1.1, 2.2), 8, 5.0
+LEAST_LINES = 8  # of a spectrum, to read the torque's noise from
 SCAN_LOW = 8.0  # lowest locked-motor frequency looked at, cycles in the record
 
 
@@ -95,7 +94,7 @@ def first_problems(
         rigid=rigid,
     )
     if both or rigid:
-        return [_with_torque_noise(fitter.relax(problem, rounds=1).problem)]
+        return [trusted(_with_torque_noise(fitter.relax(problem, rounds=1).problem))]
     known = _identified(recording, config, width) if fitted is None else fitted.base
     problems = _scanned(problem, fitter) if known is None else [problem.at(known)]
     for one in problems:
@@ -255,7 +254,7 @@ def _above_the_band(problem: Problem, s: Stretch) -> tuple[float, float] | None:
     """Level and corner of what the motor equation leaves above the band, without the encoders' part."""
     rest = _misfit(problem, s)[100:-100]
     f, density = welch(rest, s.rate_hz, int(min(rest.size, 1024)))
-    use = (f > ABOVE[0] * problem.band_hz) & (f < min(ABOVE[1] * problem.band_hz, 0.3 * s.rate_hz))
+    use = (f > ABOVE * problem.band_hz) & (f < min(HIGHEST * problem.band_hz, 0.3 * s.rate_hz))
     if np.count_nonzero(use) < LEAST_LINES:
         return None
     omega = 2.0 * np.pi * f[use]

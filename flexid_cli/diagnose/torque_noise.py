@@ -47,6 +47,8 @@ def torque_noise(segment: Segment, rate_hz: float, band_hz: float) -> tuple[floa
         too short, or its band reaches too far, to tell.
     """
     inputs = [segment.motor_position]
+    if segment.joint_position is not None:
+        inputs.append(segment.joint_position)
     lowest = ABOVE * band_hz
     if segment.reference_position is not None:
         inputs.append(segment.reference_position)
@@ -73,6 +75,7 @@ def local_variance(output: Array, inputs: Sequence[Array], lines: NDArray[np.int
     Returns
     -------
     ndarray, shape (m,)
+        Above zero.
     """
     Y, *U = (np.fft.rfft(x - x.mean()) for x in (output, *inputs))
     out = np.empty(lines.size)
@@ -86,7 +89,7 @@ def local_variance(output: Array, inputs: Sequence[Array], lines: NDArray[np.int
         solution, _, rank, _ = np.linalg.lstsq(W, Y[k], rcond=1e-10)
         left = np.abs(Y[k] - W @ solution) ** 2
         out[i] = left.sum() / max(k.size - int(rank), 1) / output.size
-    return out
+    return np.maximum(out, np.finfo(np.float64).tiny)
 
 
 def first_order(frequency_hz: Array, variance: Array, band_hz: float) -> tuple[float, float]:

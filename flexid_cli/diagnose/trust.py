@@ -31,13 +31,14 @@ def trusted(problem: Problem) -> Problem:
 
 
 def _sign_noise(problem: Problem, rng: np.random.Generator) -> list[Array]:
-    """Rows of what one more draw of the signals' noise makes of the signs, by stretch."""
+    """What one more draw of the signals' noise makes of the signs, shape (equations, rows), by stretch."""
     b, out = problem.base, []
     for s, m, w in zip(problem.stretches, problem.motions, problem.weights, strict=True):
         noisy = problem.motion(_with_noise(s, problem, rng))
         motor = b.FSm * (noisy.motor_sign - m.motor_sign)
         load = b.FS * (noisy.joint_sign - m.joint_sign)
-        out.append(w.apply([s.spectrum(problem.through(s, motor) + load)])[0, :, 0])
+        parts = [motor, load] if problem.both else [problem.through(s, motor) + load]
+        out.append(w.apply([s.spectrum(x) for x in parts])[:, :, 0])
     return out
 
 
@@ -49,11 +50,13 @@ def _with_noise(s: Stretch, problem: Problem, rng: np.random.Generator) -> Stret
         s.segment,
         torque=s.torque + noise(problem.noise.torque),
         motor_position=s.motor + noise(problem.noise.motor_position),
+        joint_position=s.joint + noise(problem.noise.joint_position) if problem.both else None,
     )
     return Stretch(segment, s.rate_hz, problem.band_hz)
 
 
 def _smoothed(power: Array, width: int) -> Array:
-    """Moving average; at the ends over what there is."""
-    kernel = np.ones(min(width, power.size))
-    return np.asarray(np.convolve(power, kernel, "same") / np.convolve(np.ones(power.size), kernel, "same"))
+    """Moving average along the rows; at the ends over what there is."""
+    kernel = np.ones(min(width, power.shape[1]))
+    there = np.convolve(np.ones(power.shape[1]), kernel, "same")
+    return np.asarray([np.convolve(p, kernel, "same") / there for p in power], dtype=np.float64)

@@ -8,7 +8,8 @@ import pytest
 from flexid_cli.diagnose.basis import solve
 from flexid_cli.diagnose.problem import Problem, Stretch
 from flexid_cli.diagnose.rows import Taper, Weights
-from flexid_cli.diagnose.start import MOST_FALL, _first_order
+from flexid_cli.diagnose.start import _first_order
+from flexid_cli.diagnose.torque_noise import MOST_FALL
 from flexid_cli.effects.motion import Base, Terms
 from flexid_cli.estimate.budget import NoiseLevels
 from flexid_cli.signals.recording import Segment
@@ -67,7 +68,7 @@ def test_back_is_the_transpose_of_apply_over_the_taper(equations, trusted_less):
     spectral = (root @ root.conj().T + 2.0 * np.eye(equations)) * ramp[:, None, None]
     spectral = spectral.real.astype(np.complex128)
     plain = Weights(taper, spectral)
-    trust = rng.uniform(0.1, 1.0, int(plain.open.sum()))
+    trust = rng.uniform(0.1, 1.0, (equations, int(plain.open.sum())))
     weights = Weights(taper, spectral, trust) if trusted_less else plain
     columns = [smooth(k) for k in range(equations)]
     rows = weights.apply([taper.spectrum(c[:, None]) for c in columns])[:, :, 0]

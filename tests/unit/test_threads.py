@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -32,3 +35,20 @@ def test_an_error_reaches_the_caller(monkeypatch: pytest.MonkeyPatch, processors
 
     with pytest.raises(DataError, match="item 0"):
         threads.side_by_side(fail, [0, 1])
+
+
+def test_an_interrupt_does_not_wait_for_the_work():
+    """In a process of its own: work that would take a minute, interrupted from within."""
+    program = (
+        "import os, signal, threading, time\n"
+        "from flexid_cli import threads\n"
+        "threads.processors = lambda: 2\n"
+        "threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
+        "try:\n    threads.side_by_side(time.sleep, [60.0, 60.0])\n"
+        "except KeyboardInterrupt:\n    print('interrupted')\n"
+    )
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, timeout=30.0, check=True
+    )
+    assert done.stdout == "interrupted\n"

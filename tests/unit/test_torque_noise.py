@@ -67,6 +67,21 @@ def test_the_unit_of_the_torque_does_not_matter():
     assert scaled == pytest.approx((1e6 * found[0], found[1]))
 
 
+@pytest.mark.parametrize("sigma", [0.0, 1e-9])
+def test_a_torque_without_noise_has_next_to_none(sigma: float):
+    found = torque_noise(loop(np.inf, sigma=sigma), RATE, BAND)
+    assert found is not None
+    # What bends in a window, 1e-7 of the torque.
+    assert 0.0 < np.sqrt(found[0]) < 3e-7 * np.std(loop(np.inf).torque)
+
+
+def test_a_torque_that_is_always_the_same_has_none():
+    segment = loop(np.inf)
+    found = torque_noise(Segment(0.0, np.ones(segment.samples), segment.motor_position), RATE, BAND)
+    assert found is not None
+    assert 0.0 < found[0] < 1e-20
+
+
 def test_a_record_too_short_to_tell_gives_nothing():
     assert torque_noise(loop(np.inf, samples=300), RATE, BAND) is None
     # Without a reference nothing is left between the band and what resampling keeps.

@@ -67,7 +67,7 @@ def rows_at(p: Problem, moving: np.ndarray) -> np.ndarray:
 def test_rows_at_a_standstill_count_less_and_those_in_motion_in_full():
     p = trusted(problem(BASE, NoiseLevels(0.02, ENCODER, 0.0)))
     assert p.trust is not None
-    [trust] = p.trust
+    [[trust]] = p.trust
     assert np.all((trust > 0.0) & (trust <= 1.0))
     assert np.median(trust[rows_at(p, MOVING)]) > 0.95
     assert np.median(trust[rows_at(p, RESTING)]) < 0.3
