@@ -71,8 +71,8 @@ def test_the_unit_of_the_torque_does_not_matter():
 def test_a_torque_without_noise_has_next_to_none(sigma: float):
     found = torque_noise(loop(np.inf, sigma=sigma), RATE, BAND)
     assert found is not None
-    # What bends in a window, 1e-7 of the torque.
-    assert 0.0 < np.sqrt(found[0]) < 3e-7 * np.std(loop(np.inf).torque)
+    # What bends in a window: far below the floor of 1e-3 of the torque that the rows have.
+    assert 0.0 < np.sqrt(found[0]) < 1e-5 * np.std(loop(np.inf).torque)
 
 
 def test_a_torque_that_is_always_the_same_has_none():
