@@ -120,14 +120,14 @@ class _Report:
         self.other = None
         if validation is not None:
             self.other = first_problems(validation, config, fitter, self.final.problem)[0]
+        self.unseen = self._unseen()
 
     def diagnosis(self) -> Diagnosis:
         """Assemble the result."""
         before, after = self.selection.before, self.final
         solved_before = solved(before)
         solved_after = solved(after) if after is not before else solved_before
-        unseen = self._unseen()
-        named = self._effects(solved_after, evidence.held_out_gain(*unseen))
+        named = self._effects(solved_after, evidence.held_out_gain(*self.unseen))
         doubt = self._doubt()
         parameters_before = self._base_parameters(before, solved_before, doubt)
         alternatives = [f for group in self.selection.alternatives for f in group] if named else []
@@ -142,7 +142,7 @@ class _Report:
             model=before.problem.model,
             effects=named,
             location=place if self.verdict in ("unexplained", "partly_explained") else None,
-            held_out=self._held_out(*unseen),
+            held_out=self._held_out(*self.unseen),
             simulation=self._simulation(parameters_before, parameters_after),
             parameters_before=parameters_before,
             parameters_after=parameters_after,
@@ -163,7 +163,17 @@ class _Report:
             return "the model leaves out something that is not known"
         if not self.final.problem.both and not self.final.problem.settled:
             return "no resonance stands out of the record, so the motor encoder alone does not show the stiffness"
+        if self._fails_elsewhere():
+            return "the model does not hold on the other recording"
         return ""
+
+    def _fails_elsewhere(self) -> float:
+        """RMS of the other recording's rows where that is more than a complete model leaves, else zero."""
+        if self.other is None:
+            return 0.0
+        parts = evidence.by_equation(self.other, self.unseen[1]).values()
+        worst = max(float(np.sqrt(np.mean(part**2))) for part in parts)
+        return worst if worst > verdict.UNEXPLAINED_RMS else 0.0
 
     def _base_parameters(
         self, fitted: Fitted, result: Solved, doubt: str, alternatives: Sequence[Fitted] = ()
@@ -293,6 +303,11 @@ class _Report:
     def _notes(self) -> tuple[str, ...]:
         problem = self.final.problem
         notes = [f"compared up to {problem.band_hz:.3g} Hz, where the encoders resolve the motion"]
+        if stays := self._fails_elsewhere():
+            notes.append(
+                f"on the other recording {stays:.2g} times the noise floor stays: what was fitted here does not hold"
+                " there"
+            )
         role = self.config.signals.torque_role
         if problem.shift > 0.0:
             notes.append(

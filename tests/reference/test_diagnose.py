@@ -73,6 +73,21 @@ def test_nothing_hidden_is_adequate():
     assert found.held_out.before == found.held_out.after
 
 
+def test_a_recording_on_which_the_model_does_not_hold_is_told():
+    """Validated on a record of a larger torque for the same motion: that of another axis."""
+    made = case((NONE,), SEED + 100_000, seconds=(20.0, 25.0))
+    config, recording = read(made)
+    segments = tuple(replace(s, torque=1.3 * s.torque) for s in recording.segments)
+    found = diagnose(recording, config, replace(recording, segments=segments))
+    assert any("does not hold there" in note for note in found.notes)
+    stiffness = estimate(found, "K")
+    assert stiffness.verdict == "weak"
+    assert "other recording" in stiffness.reason
+    same = diagnose(recording, config, recording)
+    assert not any("does not hold there" in note for note in same.notes)
+    assert_holds(same, made)
+
+
 slow = pytest.mark.slow
 
 
