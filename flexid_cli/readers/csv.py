@@ -44,7 +44,10 @@ from flexid_cli.readers.rows import RowReader, Rows
 from flexid_cli.readers.table_gaps import TablePart, lost_rows, suspect_samples, without
 
 _HEAD = 1 << 18
-_LARGE = 1 << 24  # bytes of a file that are worth threads and compiled code
+_THREADED, _COMPILED = (
+    1 << 24,
+    1 << 27,
+)  # bytes of a file that are worth threads, and the start of compiled code
 _SPLICE = 1 << 16  # samples converted in place at once
 # Damage leaves most lines whole. Where more than this share of them does not fit, the table is not written
 # as it seems to be, and what does fit may be read wrong.
@@ -387,10 +390,10 @@ class _Table:
     ) -> Generator[Rows]:
         """Parse block by block in threads, in the order of the file, and keep account."""
         encoding = self._encoding.removesuffix("-sig") if self._raw else "utf-8"
-        large = _size(self.path) >= _LARGE
-        parse = RowReader(self.dialect, encoding, wanted, compiled=large)
+        size = _size(self.path)
+        parse = RowReader(self.dialect, encoding, wanted, compiled=size >= _COMPILED)
         if threads is None:
-            threads = os.cpu_count() or 1 if large else 1
+            threads = os.cpu_count() or 1 if size >= _THREADED else 1
         stop = 0
         with closing(in_order(parse, self._blocks(advance), threads)) as items:
             for item in items:

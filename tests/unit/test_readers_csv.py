@@ -37,7 +37,8 @@ def parser(request: pytest.FixtureRequest) -> Iterator[None]:
     """Small tables as small ones, and as large ones are read."""
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "compiled":
-            patch.setattr(table, "_LARGE", 0)
+            patch.setattr(table, "_COMPILED", 0)
+            patch.setattr(table, "_THREADED", 0)
         yield
 
 
@@ -572,7 +573,7 @@ def test_blocks_and_single_lines_are_read_alike(lines: list[str], wanted: tuple[
     """Whatever stands in a block, the parser's fast way gives what the lines give one by one, or gives up."""
     fields = tuple(Field(name, None, name) for name in "abc")
     dialect = Dialect(",", ".", ("#", "%", "//"), fields, 1)
-    read_rows = blocks.RowReader(dialect, "utf-8", wanted, compiled=table._LARGE == 0)
+    read_rows = blocks.RowReader(dialect, "utf-8", wanted, compiled=table._COMPILED == 0)
     sound = b"8,9.5,10\n" * 5
     for block in (sound, ("\n".join(lines) + "\n").encode(), sound):
         rows = read_rows(block)
