@@ -30,25 +30,14 @@ def filter_in_place(x: Array, sos: Array, rest: Array, backward: bool) -> None:
         From the last sample to the first.
     """
     sections = sos.shape[0]
-    state = rest * x[-1 if backward else 0]
-    for k in range(0, sections - 1, 2):
-        _two(x, sos[k], sos[k + 1], state[k], state[k + 1], backward)
-    if sections % 2 == 1:
-        _one(x, sos[-1], state[-1], backward)
-
-
-@compiled
-def _one(x, s, z, backward):  # type: ignore[no-untyped-def] # pragma: no cover
-    b0, b1, b2, a1, a2 = s[0], s[1], s[2], s[4], s[5]
-    p, q = z[0], z[1]
-    n = x.size
-    for i in range(n):
-        k = n - 1 - i if backward else i
-        v = x[k]
-        y = b0 * v + p
-        p = b1 * v - a1 * y + q
-        q = b2 * v - a2 * y
-        x[k] = y
+    # Of an odd number the last is paired with one that lets everything through.
+    even = np.zeros((sections + sections % 2, 6))
+    even[:, 0] = 1.0
+    even[:sections] = sos
+    state = np.zeros((even.shape[0], 2))
+    state[:sections] = rest * x[-1 if backward else 0]
+    for k in range(0, even.shape[0], 2):
+        _two(x, even[k], even[k + 1], state[k], state[k + 1], backward)
 
 
 @compiled

@@ -44,10 +44,9 @@ from flexid_cli.readers.rows import RowReader, Rows
 from flexid_cli.readers.table_gaps import TablePart, lost_rows, suspect_samples, without
 
 _HEAD = 1 << 18
-_THREADED, _COMPILED = (
-    1 << 24,
-    1 << 27,
-)  # bytes of a file that are worth threads, and the start of compiled code
+# Bytes of a file that are worth threads, and the start of compiled code.
+_THREADED = 1 << 24
+_COMPILED = 1 << 27
 _SPLICE = 1 << 16  # samples converted in place at once
 # Damage leaves most lines whole. Where more than this share of them does not fit, the table is not written
 # as it seems to be, and what does fit may be read wrong.
