@@ -67,8 +67,12 @@ class Tuning:
     f1_source: str
 
 
-def choose_tuning(recording: Recording, config: Config, model_id: str, f1_hz: float | None) -> Tuning:
+def choose_tuning(
+    recording: Recording, config: Config, model_id: str, f1_hz: float | None, over_f1: float | None = None
+) -> Tuning:
     """Settings for ``model_id``; ``f1_hz`` is the resonance found in the data, used unless configured.
+
+    ``over_f1`` is the band over the resonance, `BAND_OVER_F1` unless given.
 
     Raises
     ------
@@ -79,7 +83,7 @@ def choose_tuning(recording: Recording, config: Config, model_id: str, f1_hz: fl
     f1 = configured or f1_hz
     source = "configuration" if configured else ("data" if f1 else "")
     rate = recording.sample_rate_hz
-    band = _band(recording, config, model_id, f1)
+    band = _band(recording, config, model_id, f1, over_f1 or BAND_OVER_F1.get(model_id))
     decimation = config.pipeline.decimation or max(1, int(0.5 * DECIMATION_EDGE * rate / band))
     if config.pipeline.decimation is not None:
         band = 0.5 * DECIMATION_EDGE * rate / decimation
@@ -111,7 +115,9 @@ def narrower(tuning: Tuning, config: Config, recording: Recording) -> Tuning | N
     return replace(tuning, chain=chain, sign_cutoff_hz=sign_cutoff)
 
 
-def _band(recording: Recording, config: Config, model_id: str, f1: float | None) -> float:
+def _band(
+    recording: Recording, config: Config, model_id: str, f1: float | None, over_f1: float | None
+) -> float:
     """Wanted upper edge of the band, Hz."""
     rate = recording.sample_rate_hz
     if config.pipeline.band_hz is not None:
@@ -119,8 +125,8 @@ def _band(recording: Recording, config: Config, model_id: str, f1: float | None)
     usable = usable_band(recording, joint=model_id == "two_encoders")
     if model_id == "rigid":
         wanted = RIGID_BAND_OVER_F1 * f1 if f1 else min(usable, torque_band(recording))
-    elif f1:
-        wanted = BAND_OVER_F1[model_id] * f1
+    elif f1 and over_f1:
+        wanted = over_f1 * f1
     elif model_id == "two_encoders" or config.pipeline.decimation is not None:
         wanted = usable
     else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.errors import DataError
-from flexid_cli.estimate import band, budget, methods, paper_route, replay, summary
+from flexid_cli.estimate import band, band_choice, budget, methods, paper_route, replay, summary
 from flexid_cli.estimate.fit import FitResult, block_matrices, block_matrix, fit
 from flexid_cli.estimate.least_squares import solve, triangle
 from flexid_cli.estimate.result import Identification, ModelResult, Skipped
@@ -160,7 +160,13 @@ def make_columns(recording: Recording, config: Config, tuning: band.Tuning) -> C
 
 
 def _two_encoders(recording: Recording, config: Config, f1: float | None) -> Solution:
-    tuning = band.choose_tuning(recording, config, "two_encoders", f1)
+    return methods.two_encoders(
+        _in_best_band(_two_encoders_plain, recording, config, "two_encoders", f1), config
+    )
+
+
+def _two_encoders_plain(recording: Recording, config: Config, tuning: band.Tuning) -> Solution:
+    """The weighted fit in one band, with the width of the reversal that fits best there."""
     columns = make_columns(recording, config, tuning)
 
     def cost() -> float:
@@ -172,16 +178,59 @@ def _two_encoders(recording: Recording, config: Config, f1: float | None) -> Sol
     if method not in {"ols", "wls"}:
         model = TwoEncodersStructured()
     matrices = block_matrices(model, columns)
-    result = fit(
-        model,
-        matrices,
-        _two_encoders_start(columns),
-        columns.lengths,
-        weighted=method != "ols",
-        covariance=config.estimate.covariance,
+    start, weighted = _two_encoders_start(columns), method != "ols"
+    covariance = config.estimate.covariance
+    result = fit(model, matrices, start, columns.lengths, weighted=weighted, covariance=covariance)
+    return Solution(model, columns, matrices, result, tuning, method, "configured")
+
+
+def _in_best_band(
+    solve_in: Callable[[Recording, Config, band.Tuning], Solution],
+    recording: Recording,
+    config: Config,
+    model_id: str,
+    f1: float | None,
+) -> Solution:
+    """The plain fit in the usual band, or in another one where that leaves a clearly smaller error."""
+    plain = solve_in(recording, config, band.choose_tuning(recording, config, model_id, f1))
+    f1_hz = plain.tuning.f1_hz
+    if f1_hz is None or not band_choice.is_automatic(config):
+        return plain
+    bands = band_choice.weigh(
+        model_id,
+        lambda over_f1: band.choose_tuning(recording, config, model_id, f1, over_f1),
+        lambda tuning: _outcome(plain, config, tuning),
     )
-    plain = Solution(model, columns, matrices, result, tuning, method, "configured")
-    return methods.two_encoders(plain, config)
+    if bands is not None and bands.moved:
+        plain = solve_in(recording, config, bands.tuning)
+    return replace(plain, bands=bands)
+
+
+def _outcome(plain: Solution, config: Config, tuning: band.Tuning) -> band_choice.Outcome:
+    """Jm, K and JL by a fit in another band from where the plain one stands, with what makes up their errors."""
+    columns = plain.columns
+    if tuning != plain.tuning:
+        columns = make_columns(columns.recording, config, tuning)
+        columns.set_reversal_velocity(plain.columns.reversal_velocity)
+    symbols = [p.symbol for p in plain.model.parameters]
+    if plain.model.id == "motor_only":
+        columns.rebuild_joint(*(plain.result.theta[symbols.index(s)] for s in ("Jm", "FVm", "FSm", "K")))
+    matrices, weighted = block_matrices(plain.model, columns), len(plain.model.blocks) > 1
+    result = fit(plain.model, matrices, plain.result.theta, columns.lengths, weighted=weighted)
+    solution = replace(plain, columns=columns, matrices=matrices, result=result, tuning=tuning)
+    if methods.takes_noise_out(config):
+        solution = methods.subtracted(solution)
+    uncertainty = summary.total_uncertainty(solution, config)
+    strong = [symbols.index(s) for s in ("Jm", "K", "JL")]
+    total, random = (np.diag(c)[strong] for c in (uncertainty.covariance, uncertainty.random))
+    noise = sum(s[strong] ** 2 for n, s in uncertainty.shifts.items() if n in summary.NOISES)
+    return band_choice.Outcome(
+        solution.result.theta[strong],
+        np.sqrt(random),
+        np.sqrt(noise),
+        np.sqrt(np.maximum(total - random - noise, 0.0)),
+        float(np.min(solution.result.degrees_of_freedom[strong])),
+    )
 
 
 def _two_encoders_start(columns: Columns) -> Array:
@@ -201,13 +250,17 @@ def _regress(M: Array) -> Array:
 
 def _motor_only(recording: Recording, config: Config, f1: float | None) -> Solution:
     recording = without_joint(recording)
-    tuning = band.choose_tuning(recording, config, "motor_only", f1)
+    return methods.motor_only(_in_best_band(_motor_only_plain, recording, config, "motor_only", f1), config)
+
+
+def _motor_only_plain(recording: Recording, config: Config, tuning: band.Tuning) -> Solution:
+    """The structured fit in one band, with the width of the reversal that fits best there."""
     columns = make_columns(recording, config, tuning)
     model = MotorOnly(gravity_form(recording))
     start = _motor_start(columns, model)
 
     # Instruments bring a width of their own, free of the noise that draws this one.
-    grid = COARSE_GRID if methods.uses_instruments(config) else FINE_GRID
+    grid = COARSE_GRID if methods.takes_noise_out(config) else FINE_GRID
 
     def cost() -> float:
         # The linear fit's free coefficients would hide a wrong width: only the physical ones feel it.
@@ -216,8 +269,7 @@ def _motor_only(recording: Recording, config: Config, f1: float | None) -> Solut
     columns.set_reversal_velocity(fit_reversal_velocity(columns, cost, grid=grid))
     matrices, result = _motor_fit(columns, model, start, config.estimate.covariance, rebuilds=MAX_REBUILDS)
     reason = "direct fit of the physical parameters to the exact equation (18), all terms kept"
-    plain = Solution(model, columns, matrices, result, tuning, "structured", reason)
-    return methods.motor_only(plain, config)
+    return Solution(model, columns, matrices, result, tuning, "structured", reason)
 
 
 def _motor_fit(

@@ -52,8 +52,8 @@ LOOP_REASON = (
 )
 
 
-def uses_instruments(config: Config) -> bool:
-    """Whether the motor-only model is to be solved with instruments."""
+def takes_noise_out(config: Config) -> bool:
+    """Whether the bias of the noise in the columns is to be taken out: by subtraction, and by instruments."""
     return config.estimate.method in INSTRUMENTED and config.estimate.covariance == "hac"
 
 
@@ -67,15 +67,15 @@ def two_encoders(plain: Solution, config: Config) -> Solution:
         return plain
     if method == "irls":
         return _robust(plain, weighted=True)
-    subtracted = _subtracted(plain)
+    free = subtracted(plain)
     if method == "iv":
-        return _with_instruments(subtracted, plain, config)
+        return _with_instruments(free, plain, config)
     if method == "output_error":
-        return _output_error(subtracted)
+        return _output_error(free)
     if method == "minimum_distance":
         note = "minimum_distance is for the free coefficients of motor_only; structured was used"
-        return replace(subtracted, notes=(*subtracted.notes, f"{plain.model.id}: {note}"))
-    return subtracted
+        return replace(free, notes=(*free.notes, f"{plain.model.id}: {note}"))
+    return free
 
 
 def motor_only(plain: Solution, config: Config) -> Solution:
@@ -83,7 +83,7 @@ def motor_only(plain: Solution, config: Config) -> Solution:
     method = config.estimate.method
     if method == "irls":
         return _robust(plain, weighted=False)
-    if not uses_instruments(config):
+    if not takes_noise_out(config):
         return plain
     driven = _instrumented(plain)
     if driven.instruments is None:
@@ -97,7 +97,7 @@ def motor_only(plain: Solution, config: Config) -> Solution:
     return driven
 
 
-def _subtracted(plain: Solution) -> Solution:
+def subtracted(plain: Solution) -> Solution:
     """The fit without the bias of the noise in its columns."""
     levels = noise.floors(plain.columns.recording)
     refined = refine(plain.model, plain.columns, plain.matrices, plain.result, levels)

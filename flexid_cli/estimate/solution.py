@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.estimate.band import Tuning
+from flexid_cli.estimate.band_choice import BandChoice
 from flexid_cli.estimate.fit import FitResult
 from flexid_cli.models.base import Model
 from flexid_cli.pipeline.columns import Columns
@@ -61,6 +62,8 @@ class Solution:
         What a person should know of the estimator: a fallback and its reason.
     reduction : Reduction or None
         Which parameters were tested and set to zero; None where all were fitted without a test.
+    bands : BandChoice or None
+        Bands that were tried, where the choice was left to the data.
     """
 
     model: Model
@@ -75,6 +78,7 @@ class Solution:
     outputs: FitResult | None = None
     notes: tuple[str, ...] = field(default_factory=tuple)
     reduction: Reduction | None = None
+    bands: BandChoice | None = None
 
     @property
     def reported(self) -> FitResult:

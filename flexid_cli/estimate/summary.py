@@ -37,6 +37,8 @@ SUMS = (
     (Parameter("viscous_friction", "FVm + FV", "viscous"), ("FVm", "FV")),
     (Parameter("coulomb_friction", "FSm + FS", "torque"), ("FSm", "FS")),
 )
+# Sources of systematic errors that are noise in the columns: what is subtracted, or all of it.
+NOISES = ("doubt about the noise in the columns", "encoder and torque noise in the columns")
 CLEAR_GEAR_SIGMA = 5.0
 # A ratio of tooth numbers is off by one tooth or not at all: by a thousandth for a ratio of a thousand.
 SMALLEST_GEAR_ERROR = 1e-3
@@ -103,6 +105,8 @@ def analyse(
     estimates = _estimates(solution, config, uncertainty, parameters, theta, covariance)
     fitted = _fit(solution)
     doubt = model_doubt(estimates, fitted.fit_percent)
+    if solution.bands is not None:
+        tests["band"] = solution.bands.test()
     tests["torque_delay"] = timing.timing_test(uncertainty.delay, solution, timing.DELAY_MEANING)
     if uncertainty.skew is not None:
         tests["encoder_skew"] = timing.timing_test(uncertainty.skew, solution, timing.SKEW_MEANING)
@@ -190,14 +194,12 @@ def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -
         shifts |= solution.reduction.shifts
     if config.estimate.covariance == "hac":
         if solution.correction is not None:
-            shifts["doubt about the noise in the columns"] = solution.correction.doubt
+            shifts[NOISES[0]] = solution.correction.doubt
         else:
             levels = budget.limited_torque_noise(
                 model, result, columns, budget.noise_levels(columns.recording)
             )
-            shifts["encoder and torque noise in the columns"] = budget.noise_bias(
-                model, result, columns, levels
-            )
+            shifts[NOISES[1]] = budget.noise_bias(model, result, columns, levels)
         torque = config.signals.torque
         if torque.hold != "instant":
             # Declared held, its damping has been applied; but no current controller makes exact steps.

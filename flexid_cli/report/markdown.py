@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 FIGURE_KINDS = ("torque", "filter", "spectrum")
 _ROLES = {"recording": "Input", "validation": "Other run", "parameters": "Known parameters"}
 _SMALLEST_P_VALUE = 0.001
+_UNITS = {"s": "s", "hz": "Hz"}
 _CLOCK_COUNTS = ("gaps", "bridged", "duplicates", "reordered", "resets", "invalid")
 
 
@@ -107,8 +108,10 @@ def _facts(test: Mapping[str, Any]) -> str:
 
 
 def _fact(key: str, value: object) -> str:
-    name, unit = (key[:-2], " s") if key.endswith("_s") and value is not None else (key, "")
-    return f"{_phrase(name)} {_value(key, value)}{unit}"
+    name, _, last = key.rpartition("_")
+    if last not in _UNITS or value is None:
+        return f"{_phrase(key)} {_value(key, value)}"
+    return f"{_phrase(name)} {_value(key, value)} {_UNITS[last]}"
 
 
 def _phrase(key: str) -> str:

@@ -113,7 +113,7 @@ def test_the_report_holds_every_test(recording: Recording):
 def test_instruments_for_both_paths_are_known_to_the_configuration():
     for method in METHODS:
         config = parse_config(TEXT.format(model="motor_only", method=method))
-        assert methods.uses_instruments(config) == (
+        assert methods.takes_noise_out(config) == (
             method in {"auto", "iv", "minimum_distance", "output_error"}
         )
 
