@@ -137,9 +137,9 @@ class Search:
         if not np.all(norm > DEPENDENT * np.maximum(np.linalg.norm(C, axis=0), 1e-300)):
             nothing, why = np.zeros(C.shape[1]), "its columns depend on the model's"
             return Candidate(form, shape, nothing, before, before, count, why)
-        q, r = np.linalg.qr(P / norm)
+        q, r = np.linalg.qr(P / norm) if P.shape[1] > 1 else (P / norm, np.eye(1))
         z = q.T @ now.residual
-        amplitudes = np.linalg.lstsq(r, z, rcond=None)[0] / norm
+        amplitudes = np.linalg.lstsq(r, z, rcond=None)[0] / norm if z.size > 1 else z / norm
         refused = self._refused(form, shape, amplitudes)
         cost = before if refused else max(before - float(z @ z), 0.0)
         if not refused and signature.tied is not None:
