@@ -48,7 +48,8 @@ class Taper:
         # The zeros behind the record keep the weighting's reach from wrapping around.
         transform = next_fast_len(samples + round(rate_hz), real=True)
         frequency = np.asarray(np.fft.rfftfreq(transform, 1.0 / rate_hz), dtype=np.float64)
-        return cls(window, samples, transform, frequency[frequency <= band_hz], rate_hz)
+        kept = _fast(int(np.count_nonzero(frequency <= band_hz)) - 1) + 1
+        return cls(window, samples, transform, frequency[:kept], rate_hz)
 
     def spectrum(self, x: Array) -> Complex:
         """Transform of the tapered columns, shape (frequencies, k) from (n, k)."""
@@ -63,6 +64,13 @@ class Taper:
             tapered[self.samples :] = 0.0
             row[:] = rfft(tapered)[:kept]
         return out.T
+
+
+def _fast(count: int) -> int:
+    """Largest number of lines up to ``count`` whose transform is fast: one to two percent less at most."""
+    from scipy.fft import next_fast_len
+
+    return next((n for n in range(count, 0, -1) if next_fast_len(n) == n), count)
 
 
 class Weights:
