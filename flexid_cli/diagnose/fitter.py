@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,18 +11,18 @@ from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import Basis, solve
 from flexid_cli.diagnose.problem import Problem
-from flexid_cli.diagnose.search import Candidate, Form, Search, gained, golden
+from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
 from flexid_cli.effects.motion import Base
+from flexid_cli.threads import side_by_side
 
 Array = NDArray[np.float64]
 
 SETTLED = 1e-3  # change of the cost's logarithm
-WIDTH_STEPS = 6
-WIDTH_RANGE = 1.2  # of the logarithm of a reversal width, around the present one
+# Of the logarithm of a reversal width about the present one: its range, where it is looked at first, and how near.
+WIDTH_RANGE, WIDTH_STEP, WIDTH_NEAR, MOST_WIDTHS = 1.2, 0.4, 0.02, 6
 REVERSALS = {"motor_reversal": "FSm", "load_reversal": "FS"}  # widths of the base and their friction
 REVERSAL = 3.0  # widths about zero velocity that a reversal takes
 NARROWEST = 1e-5  # reversal width, rad/s or m/s
-THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -151,12 +150,18 @@ class Fitter:
                 columns.append(rows)
         return Fitted(problem, search, tuple(chosen), solve(np.hstack(columns), y), y)
 
-    def relax(self, problem: Problem, chosen: Sequence[Chosen] = (), rounds: int = 3) -> Fitted:
+    def relax(
+        self,
+        problem: Problem,
+        chosen: Sequence[Chosen] = (),
+        rounds: int = 3,
+        search: Search | None = None,
+    ) -> Fitted:
         """Fit; move linearisation, reversal widths, the torque's timing and shapes.
 
-        That is repeated until nothing changes, or ``rounds`` times.
+        That is repeated until nothing changes, or ``rounds`` times. A ``search`` of the problem spares its columns.
         """
-        fitted = self.fit(problem, chosen)
+        fitted = self.fit(problem, chosen, search)
         best = fitted
         for _ in range(rounds):
             base = self._widths(fitted, self.moved(fitted))
@@ -172,6 +177,10 @@ class Fitter:
             if abs(gained) < SETTLED:
                 break
         return best
+
+    def relaxed(self, fitted: Fitted, models: Iterable[Sequence[Chosen]], rounds: int = 2) -> list[Fitted]:
+        """Other sets of effects in the place of a fit's, each relaxed from where that is linearised."""
+        return side_by_side(lambda m: self.relax(fitted.problem, m, rounds, fitted.search), models)
 
     def _reversing(self, fitted: Fitted) -> Fitted:
         """Without a joint encoder, the likelier of the two ways to tell when the load reverses."""
@@ -197,7 +206,7 @@ class Fitter:
         return fitted.problem.moved(fitted.basis.coefficients[: len(names)], fitted.stiffening)
 
     def _widths(self, fitted: Fitted, base: Base) -> Base:
-        """Reversal widths by golden section, of all friction that changes its sign there."""
+        """The likeliest reversal widths, of all friction that changes its sign there."""
         problem = fitted.problem
         for field, symbol in REVERSALS.items():
             if symbol not in problem.names:
@@ -211,8 +220,10 @@ class Fitter:
                 e = fitted.basis.outside(fitted.y - friction * change)
                 return float(e @ e)
 
-            best = golden(cost, max(now - WIDTH_RANGE, np.log(NARROWEST)), now + WIDTH_RANGE, WIDTH_STEPS)
-            if cost(best) < fitted.cost:
+            low, high = max(now - WIDTH_RANGE, np.log(NARROWEST)), now + WIDTH_RANGE
+            first = (max(now - WIDTH_STEP, low), now, now + WIDTH_STEP)
+            best, least = minimum(cost, low, high, first, WIDTH_NEAR, MOST_WIDTHS)
+            if least < fitted.cost:
                 base = replace(base, **{field: float(np.exp(best))})
         return base
 
@@ -249,8 +260,8 @@ class Fitter:
         )
         taken = {c.name for c in now.chosen}
         forms = [f for f in self.forms if f.name not in taken]
-        with ThreadPoolExecutor(THREADS) as pool:
-            found = [c for c in pool.map(lambda f: fitted.search.best(f, now.basis), forms) if c is not None]
+        best = side_by_side(lambda f: fitted.search.best(f, now.basis), forms)
+        found = [c for c in best if c is not None]
         by_name: dict[str, Candidate] = {}
         for c in found:
             if c.form.name not in by_name or c.rank < by_name[c.form.name].rank:

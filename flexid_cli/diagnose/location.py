@@ -214,22 +214,34 @@ def _line(problem: Problem, now: Basis, equation: str) -> Map:
 
 def _transform(problem: Problem, e: Array, grid: Array) -> NDArray[np.complex128]:
     """Fourier sums of the rows ``e`` of one equation at a uniform grid of frequencies."""
-    from scipy.signal import czt
-
     out, first = np.zeros(grid.size, dtype=np.complex128), 0
     for s, w in zip(problem.stretches, problem.weights, strict=True):
         # Rows are uniform within a stretch.
         count, step = w.seconds.size, float(w.seconds[1] - w.seconds[0])
-        turn = -2j * np.pi * step
-        sums = czt(
-            e[first : first + count],
-            grid.size,
-            np.exp(turn * (grid[1] - grid[0])),
-            np.exp(-turn * grid[0]),
+        sums = chirp_transform(
+            e[first : first + count], step * grid[0], step * (grid[1] - grid[0]), grid.size
         )
         out += sums * np.exp(-2j * np.pi * grid * (s.start_s + w.seconds[0]))
         first += count
     return out
+
+
+def chirp_transform(x: Array, first: float, step: float, count: int) -> NDArray[np.complex128]:
+    """Fourier sums of ``x`` at ``count`` frequencies from ``first`` on, in cycles a sample.
+
+    Bluestein's chirp z-transform: 2 n k = n^2 + k^2 - (k - n)^2 makes a convolution of it.
+    """
+    from scipy.fft import fft, ifft, next_fast_len
+
+    n, k = np.arange(x.size), np.arange(count)
+    size = next_fast_len(x.size + count - 1)
+
+    def chirp(at: NDArray[np.int64]) -> NDArray[np.complex128]:
+        return np.asarray(np.exp(-1j * np.pi * step * at.astype(np.float64) ** 2))
+
+    kernel = np.conj(chirp(np.arange(1 - x.size, count)))
+    sums = ifft(fft(x * np.exp(-2j * np.pi * first * n) * chirp(n), size) * fft(kernel, size))
+    return np.asarray(chirp(k) * sums[x.size - 1 : x.size - 1 + count])
 
 
 def located(found: Map, recording: Recording) -> Where:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from flexid_cli.diagnose.search import Form
 
 Array = NDArray[np.float64]
+Numbers = TypeVar("Numbers", Array, Complex)
 Part = Callable[["Stretch", Motion], Sequence["Complex | None"]]
 
 HALF_WIDTH = 12  # of the derivatives: exact to 1e-6 up to a third of the sampling rate
@@ -80,6 +81,51 @@ class Stretch:
         if self.joint.size:
             self.joint_smooth = self.lowpass(self.joint, SMOOTH_BAND)
             self.joint_sharp = self.derivative(self.lowpass(self.joint, JOINT_SIGN_BAND), 1)
+
+    @cached_property
+    def motor_acceleration(self) -> Array:
+        """Second derivative of the low-passed motor position, shape (n,)."""
+        return self.derivative(self.motor_smooth, 2)
+
+    @cached_property
+    def torque_smooth(self) -> Array:
+        """Low-passed torque, shape (n,)."""
+        return self.lowpass(self.torque, SMOOTH_BAND)
+
+    @cached_property
+    def joint_derivatives(self) -> tuple[Array, Array]:
+        """First and second derivative of the low-passed joint position, each (n,)."""
+        return self.derivative(self.joint_smooth, 1), self.derivative(self.joint_smooth, 2)
+
+    @cached_property
+    def both_spectra(self) -> dict[str, Complex]:
+        """Transforms that the equations of both encoders are made of, wherever they are linearised; each (f, k)."""
+        one, joint = np.ones(self.torque.size), self.joint
+        return {
+            "torque": self.spectrum(self.torque),
+            "one": self.spectrum(one),
+            "torsion": self.spectrum(self.motor - joint),
+            "motor": self._spectra([self.derivative(self.motor, 2), self.derivative(self.motor, 1)]),
+            "joint": self._spectra([self.derivative(joint, 2), self.derivative(joint, 1)]),
+            "gravity": self._spectra([np.cos(self.joint_smooth), np.sin(self.joint_smooth)]),
+        }
+
+    @cached_property
+    def alone_spectra(self) -> dict[str, Complex]:
+        """Transforms of torque, motor acceleration and velocity, each with its first and second derivative (f, 3)."""
+        signals = {
+            "torque": self.torque,
+            "acceleration": self.derivative(self.motor, 2),
+            "velocity": self.derivative(self.motor, 1),
+        }
+        return {name: self.differentiated(x) for name, x in signals.items()}
+
+    def differentiated(self, x: Array) -> Complex:
+        """Transform of a signal, of its first and of its second derivative, shape (f, 3)."""
+        return self._spectra([x, self.derivative(x, 1), self.derivative(x, 2)])
+
+    def _spectra(self, signals: Sequence[Array]) -> Complex:
+        return np.hstack([self.spectrum(x) for x in signals])
 
     def with_joint(self, joint: Array) -> Stretch:
         """The same stretch with another joint position."""
@@ -273,13 +319,14 @@ class Problem:
         motor_sign = reversal(s.motor_sharp, base.motor_reversal)
         if self.both:
             joint, sharp = s.joint_smooth, s.joint_sharp
+            velocity, acceleration = s.joint_derivatives
         else:
             friction = base.FVm * s.motor_velocity + base.FSm * s.lowpass(motor_sign, SMOOTH_BAND)
-            inertial = base.Jm * s.derivative(s.motor_smooth, 2)
-            joint = s.motor_smooth - (s.lowpass(s.torque, SMOOTH_BAND) - inertial - friction) / base.K
+            inertial = base.Jm * s.motor_acceleration
+            joint = s.motor_smooth - (s.torque_smooth - inertial - friction) / base.K
             joint = s.lowpass(joint, SMOOTH_BAND)
-            sharp = s.derivative(self._led(s) if self.led else joint, 1)
-        velocity = s.derivative(joint, 1)
+            velocity, acceleration = s.derivative(joint, 1), s.derivative(joint, 2)
+            sharp = s.derivative(self._led(s), 1) if self.led else velocity
         return Motion(
             time_s=s.time_s,
             torque=s.torque,
@@ -287,7 +334,7 @@ class Problem:
             motor_velocity=s.motor_velocity,
             joint_position=joint,
             joint_velocity=velocity,
-            joint_acceleration=s.derivative(joint, 2),
+            joint_acceleration=acceleration,
             motor_sign=motor_sign,
             joint_sign=reversal(sharp, base.load_reversal),
             deflection=s.motor_smooth - joint - base.torsion_zero,
@@ -335,20 +382,25 @@ class Problem:
         late = self.shift if shift is None else shift
 
         def part(s: Stretch, m: Motion) -> list[Complex | None]:
-            torque = s.torque if self.both else self.through(s, s.torque)
-            spectrum = _later(s, s.spectrum(torque), late)
             if self.both:
-                return [spectrum, s.spectrum(self._spring(s))]
-            b = self.base
-            acceleration, velocity = s.derivative(s.motor, 2), s.derivative(s.motor, 1)
-            motor = b.Jm * acceleration + b.FVm * velocity + b.FSm * m.motor_sign
-            load = b.JL * acceleration + b.FV * velocity + b.FS * m.joint_sign
-            return [spectrum - s.spectrum(self.through(s, motor) + load)]
+                return [_later(s, s.both_spectra["torque"], late), self.stiffness * self._twist(s)]
+            known, b = s.alone_spectra, self.base
+            acceleration, velocity = known["acceleration"], known["velocity"]
+            motor = b.Jm * acceleration + b.FVm * velocity + b.FSm * s.differentiated(m.motor_sign)
+            load = b.JL * acceleration[:, :1] + b.FV * velocity[:, :1] + b.FS * s.spectrum(m.joint_sign)
+            return [_later(s, self._passed(known["torque"]), late) - self._passed(motor) - load]
 
         return self._rows(part)[:, 0]
 
-    def _spring(self, s: Stretch) -> Array:
-        return self.stiffness * (s.motor - s.joint - self.base.torsion_zero)
+    def _twist(self, s: Stretch) -> Complex:
+        """Transform of the torsion without its zero, shape (f, 1)."""
+        known = s.both_spectra
+        return np.asarray(known["torsion"] - self.base.torsion_zero * known["one"])
+
+    def _passed(self, differentiated: Complex) -> Complex:
+        """`through` of a signal that is given with its derivatives, (f, 3) to (f, 1)."""
+        b = self.base
+        return np.asarray(differentiated @ np.array([[1.0], [b.FV / b.K], [b.JL / b.K]]))
 
     def signal(self) -> float:
         """RMS of the torque in the whitened rows of the motor equation: how far it stands above its noise."""
@@ -364,37 +416,38 @@ class Problem:
         return self._rows(self._base_both if self.both else self._base_alone)
 
     def _base_both(self, s: Stretch, m: Motion) -> list[Complex]:
-        one, torsion = np.ones(s.torque.size), s.motor - s.joint - self.base.torsion_zero
-        motor = [s.derivative(s.motor, 2), s.derivative(s.motor, 1), m.motor_sign, torsion, one]
-        load = [-one, s.derivative(s.joint, 2), s.derivative(s.joint, 1), m.joint_sign]
-        load += [self.gravity * np.cos(m.joint_position), self.gravity * np.sin(m.joint_position)]
-        return self._side_by_side(s, motor, load)
+        known = s.both_spectra
+        one, gravity = known["one"], self.gravity * known["gravity"]
+        motor = [known["motor"], s.spectrum(m.motor_sign), self._twist(s), one]
+        load = [-one, known["joint"], s.spectrum(m.joint_sign), gravity]
+        return self._side_by_side(np.hstack(motor), np.hstack(load))
 
     @staticmethod
-    def _side_by_side(s: Stretch, motor: Sequence[Array], load: Sequence[Array]) -> list[Complex]:
+    def _side_by_side(M: Complex, L: Complex) -> list[Complex]:
         """Columns of both equations; the last of the motor's are the first of the load's."""
-        M, L = s.spectrum(np.column_stack(motor)), s.spectrum(np.column_stack(load))
-        own = len(load) - SHARED, len(motor) - SHARED
+        own = L.shape[1] - SHARED, M.shape[1] - SHARED
         return [
             np.hstack([M, np.zeros((M.shape[0], own[0]))]),
             np.hstack([np.zeros((M.shape[0], own[1])), L]),
         ]
 
     def _base_alone(self, s: Stretch, m: Motion) -> list[Complex | None]:
-        b = self.base
-        acceleration, velocity = s.derivative(s.motor, 2), s.derivative(s.motor, 1)
-        passed = s.torque - b.Jm * acceleration - b.FVm * velocity - b.FSm * m.motor_sign
-        first, second = s.derivative(passed, 1), s.derivative(passed, 2)
-        columns = [self.through(s, x) for x in (acceleration, velocity, m.motor_sign)]
+        b, known = self.base, s.alone_spectra
+        acceleration, velocity, sign = (
+            known["acceleration"], known["velocity"], s.differentiated(m.motor_sign)
+        )  # fmt: skip
+        columns = [self._passed(x) for x in (acceleration, velocity, sign)]
         if self.rigid:
-            return [s.spectrum(np.column_stack([*columns, np.ones(s.torque.size)]))]
+            return [np.hstack([*columns, s.spectrum(np.ones(s.torque.size))])]
+        passed = known["torque"] - b.Jm * acceleration - b.FVm * velocity - b.FSm * sign
+        first, second = passed[:, 1:2], passed[:, 2:3]
         columns += [
             (b.JL * second + b.FV * first) / b.K**2,
-            acceleration - second / b.K,
-            velocity - first / b.K,
-            m.joint_sign,
+            acceleration[:, :1] - second / b.K,
+            velocity[:, :1] - first / b.K,
+            s.spectrum(m.joint_sign),
         ]
-        return [s.spectrum(np.column_stack(columns))]
+        return [np.hstack(columns)]
 
     def sign_rows(self, field: str, width: float) -> Array:
         """Rows of one Coulomb column for another reversal width, shape (r,)."""
@@ -418,7 +471,7 @@ class Problem:
             zero = np.zeros(s.torque.size)
             motor = [s.derivative(s.motor, 2), s.derivative(s.motor, 1), zero, s.motor - s.joint, zero]
             load = [zero, s.derivative(s.joint, 2), s.derivative(s.joint, 1), zero, zero, zero]
-            M, L = self._side_by_side(s, motor, load)
+            M, L = self._side_by_side(*(s.spectrum(np.column_stack(x)) for x in (motor, load)))
             spring = s.spectrum(self.stiffness * (s.motor - s.joint))
             return [np.hstack([np.zeros_like(spring), M]), np.hstack([spring, L])]
 
@@ -490,18 +543,21 @@ class Problem:
 
     def _place_both(self, s: Stretch, t: Terms) -> list[Complex | None]:
         b = self.base
-        motor, load = t.motor, t.load
+        motor, load = (None if x is None else s.spectrum(x) for x in (t.motor, t.load))
         if t.transmission is not None:
-            motor, load = _plus(motor, t.transmission), _plus(load, -t.transmission)
+            passed_on = s.spectrum(t.transmission)
+            motor, load = _plus(motor, passed_on), _plus(load, -passed_on)
         if t.joint_error is not None:
             e = t.joint_error
-            motor = _plus(motor, b.K * e)
-            load = _plus(load, -(b.JL * s.derivative(e, 2) + b.FV * s.derivative(e, 1) + b.K * e))
+            motor = _plus(motor, b.K * s.spectrum(e))
+            load = _plus(load, -s.spectrum(b.JL * s.derivative(e, 2) + b.FV * s.derivative(e, 1) + b.K * e))
         if t.motor_error is not None:
             e = t.motor_error
-            motor = _plus(motor, -(b.Jm * s.derivative(e, 2) + b.FVm * s.derivative(e, 1) + b.K * e))
-            load = _plus(load, b.K * e)
-        return [None if x is None else s.spectrum(x) for x in (motor, load)]
+            motor = _plus(
+                motor, -s.spectrum(b.Jm * s.derivative(e, 2) + b.FVm * s.derivative(e, 1) + b.K * e)
+            )
+            load = _plus(load, b.K * s.spectrum(e))
+        return [motor, load]
 
     def _place_alone(self, s: Stretch, t: Terms) -> list[Complex | None]:
         b = self.base
@@ -628,5 +684,5 @@ def _later(s: Stretch, spectrum: Complex, periods: float) -> Complex:
     return np.asarray(spectrum * np.exp(-2j * np.pi * f * periods * s.period_s) * damping)
 
 
-def _plus(a: Array | None, b: Array) -> Array:
+def _plus(a: Numbers | None, b: Numbers) -> Numbers:
     return b if a is None else a + b

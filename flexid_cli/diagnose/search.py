@@ -17,7 +17,10 @@ from flexid_cli.effects.signature import Scale, Signature
 Array = NDArray[np.float64]
 
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-TRIED_STEPS, REFINED_STEPS = 7, 10  # of a golden section: for a candidate, and for an effect of the model
+# How near a shape is found, in steps of its grid, and how many points are tried for it.
+TRIED, REFINED = 0.01, 0.002  # for a candidate, and for an effect of the model
+MOST_TRIED = 12
+CLOSE = 20.0  # times the nearness: spread of the points of a parabola whose vertex is believed
 PEAKS = 5  # of a search over cycles that are looked at exactly
 NORMS = 16  # cycles at which a ripple's size in the rows is worked out
 DEPENDENT = 1e-7  # a column with less than this share outside the model's is the model's
@@ -137,9 +140,8 @@ class Search:
         if not np.all(norm > DEPENDENT * np.maximum(np.linalg.norm(C, axis=0), 1e-300)):
             nothing, why = np.zeros(C.shape[1]), "its columns depend on the model's"
             return Candidate(form, shape, nothing, before, before, count, why)
-        q, r = np.linalg.qr(P / norm)
-        z = q.T @ now.residual
-        amplitudes = np.linalg.lstsq(r, z, rcond=None)[0] / norm
+        z, amplitudes = _explained(P / norm, now.residual)
+        amplitudes = amplitudes / norm
         refused = self._refused(form, shape, amplitudes)
         cost = before if refused else max(before - float(z @ z), 0.0)
         if not refused and signature.tied is not None:
@@ -162,7 +164,7 @@ class Search:
             return None
         points = self._ripples(form, shapes[0], now) if form.signature.ripple else _grid(shapes)
         best = min((self.evaluate(form, p, now) for p in points), key=lambda c: c.rank)
-        return best if not shapes or best.refused else self.refine(best, now, TRIED_STEPS)
+        return best if not shapes or best.refused else self.refine(best, now, TRIED)
 
     def _ripples(self, form: Form, shape: Shape, now: Basis) -> list[tuple[float, ...]]:
         """Cycles at which a ripple over the motor's angle would explain most, by one transform over all of them."""
@@ -189,31 +191,43 @@ class Search:
             self._norms[form.name] = some, np.asarray(norms)
         return np.maximum(np.interp(cycles, *self._norms[form.name]), 1e-300)
 
-    def refine(self, best: Candidate, now: Basis, sections: int = REFINED_STEPS) -> Candidate:
-        """Golden section along each shape parameter in turn, between the neighbours of the best point."""
+    def refine(self, best: Candidate, now: Basis, near: float = REFINED) -> Candidate:
+        """Search along each shape parameter in turn, between the neighbours of the best point."""
         shapes = self.shapes(best.form)
         if not shapes:
             return best
         steps = [_step(s) for s in shapes]
         for _ in range(2 if len(shapes) > 1 else 1):
             for k, s in enumerate(shapes):
-                best = self._along(best, k, s, steps[k], now, sections)
+                best = self._along(best, k, s, steps[k], now, near)
                 steps[k] *= 0.3
         return best
 
-    def _along(self, best: Candidate, k: int, s: Shape, step: float, now: Basis, sections: int) -> Candidate:
+    def _along(self, best: Candidate, k: int, s: Shape, step: float, now: Basis, near: float) -> Candidate:
         to, back = (np.log, np.exp) if s.spacing == "log" else (float, float)
         centre = float(to(best.shape[k]))
         low, high = max(centre - step, float(to(s.low))), min(centre + step, float(to(s.high)))
         found = [best]
 
         def cost(u: float) -> float:
-            shape = (*best.shape[:k], float(back(u)), *best.shape[k + 1 :])
-            found.append(self.evaluate(best.form, shape, now))
+            if u == centre:
+                return best.cost
+            value = _as_in_the_grid(float(back(u)), s)
+            found.append(self.evaluate(best.form, (*best.shape[:k], value, *best.shape[k + 1 :]), now))
             return found[-1].cost
 
-        golden(cost, low, high, sections)
+        minimum(cost, low, high, (low, centre, high), near * step, MOST_TRIED)
         return min(found, key=lambda c: c.rank)
+
+
+def _explained(P: Array, residual: Array) -> tuple[Array, Array]:
+    """Of a residual the part in the span of columns of norm one, in an orthonormal basis, and its coefficients."""
+    if P.shape[1] == 1:
+        z = P.T @ residual
+        return z, z
+    q, r = np.linalg.qr(P)
+    z = q.T @ residual
+    return z, np.linalg.lstsq(r, z, rcond=None)[0]
 
 
 def gained(before: float, after: float, rows: int) -> float:
@@ -225,20 +239,73 @@ def gained(before: float, after: float, rows: int) -> float:
     return float(np.log((before + rows) / (after + rows)))
 
 
-def golden(cost: Callable[[float], float], low: float, high: float, steps: int) -> float:
-    """Minimum of a function of one variable by golden section; the best point that was tried."""
-    c, d = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-    fc, fd = cost(c), cost(d)
-    for _ in range(steps):
-        if fc < fd:
-            high, d, fd = d, c, fc
-            c = high - GOLDEN * (high - low)
-            fc = cost(c)
-        else:
-            low, c, fc = c, d, fd
-            d = low + GOLDEN * (high - low)
-            fd = cost(d)
-    return float(c if fc < fd else d)
+def minimum(
+    cost: Callable[[float], float], low: float, high: float, first: Sequence[float], near: float, most: int
+) -> tuple[float, float]:
+    """Minimum of a function of one variable, and its place, by Brent's method.
+
+    Parabolas through the three best points, and golden sections where these do not help: R. P. Brent, "Algorithms
+    for minimization without derivatives", Prentice-Hall, 1973, chapter 5.
+
+    Parameters
+    ----------
+    cost : callable
+    low, high : float
+        Bounds of the place.
+    first : sequence of float
+        Places within the bounds to begin with.
+    near : float
+        Step that is too short to be made.
+    most : int
+        Points that are tried after the first ones.
+
+    Returns
+    -------
+    place, cost : float
+        Of the best point that was tried.
+    """
+    points = sorted((cost(u), u) for u in sorted(set(first)))
+    x = points[0][1]
+    a, b = (
+        max((u for _, u in points if u < x), default=low),
+        min((u for _, u in points if u > x), default=high),
+    )
+    last = before = b - a
+    for _ in range(most):
+        fx, x = points[0]
+        step = _to_vertex(points)
+        if not a < x + step < b or abs(step) > 0.5 * before:
+            step = (1.0 - GOLDEN) * (b - x if b - x > x - a else a - x)
+        spread = max(u for _, u in points[:3]) - min(u for _, u in points[:3])
+        if abs(step) < near:
+            if spread < CLOSE * near:
+                break
+            # A parabola through points far apart may be wrong about it.
+            step = np.copysign(min(0.2 * spread, 0.5 * (b - x if step > 0.0 else x - a)), step)
+        u = x + step
+        fu = cost(u)
+        better, worse = (u, x) if fu < fx else (x, u)
+        a, b = (worse, b) if worse < better else (a, worse)
+        points = sorted([*points, (fu, u)])
+        before, last = last, abs(step)
+    return points[0][1], points[0][0]
+
+
+def _to_vertex(points: Sequence[tuple[float, float]]) -> float:
+    """From the best of the points to the vertex of the parabola through the best three; infinite where none is."""
+    if len(points) < 3:
+        return np.inf
+    (f0, x0), (f1, x1), (f2, x2) = points[:3]
+    slope, other = (f1 - f0) / (x1 - x0), (f2 - f0) / (x2 - x0)
+    curvature = (slope - other) / (x1 - x2)
+    return 0.5 * (x1 - x0 - slope / curvature) if curvature > 0.0 else np.inf
+
+
+def _as_in_the_grid(value: float, s: Shape) -> float:
+    """The grid's own number for a value that rounding sets apart from it: its columns are there already."""
+    grid = s.grid()
+    nearest = float(grid[np.argmin(np.abs(grid - value))])
+    return nearest if abs(nearest - value) < 1e-9 * abs(value) else value
 
 
 def _grid(shapes: Sequence[Shape]) -> list[tuple[float, ...]]:

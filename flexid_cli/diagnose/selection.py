@@ -10,6 +10,7 @@ import numpy as np
 from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter, without
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.search import Candidate
+from flexid_cli.threads import side_by_side
 
 MOST_EFFECTS = 4
 RIVALS = 3
@@ -73,18 +74,21 @@ def _start(fitter: Fitter, problems: Sequence[Problem]) -> tuple[Problem, tuple[
     """
     if len(problems) == 1:
         return problems[0], ()
-    found = []
-    for problem in problems:
-        fitted = fitter.relax(problem, rounds=1)
-        both = (fitted, _added(fitter, fitted, fitter.candidates(fitted)))
-        possible = [f for f in both if f is not None and f.is_possible]
-        if possible:
-            found.append((problem, min(possible, key=lambda f: f.loss)))
+    fits = side_by_side(lambda problem: _alone_or_with_one(fitter, problem), problems)
+    found = [(problem, fit) for problem, fit in zip(problems, fits, strict=True) if fit is not None]
     if not found:
         return problems[0], ()
     best, fit = min(found, key=lambda start: start[1].loss)
     near = [f for p, f in found if p is not best and f.loss - fit.loss < threshold(best)]
     return best, tuple(near)
+
+
+def _alone_or_with_one(fitter: Fitter, problem: Problem) -> Fitted | None:
+    """The baseline from a start, or it with the effect that explains most there; None where neither is possible."""
+    fitted = fitter.relax(problem, rounds=1)
+    both = (fitted, _added(fitter, fitted, fitter.candidates(fitted)))
+    possible = [f for f in both if f is not None and f.is_possible]
+    return min(possible, key=lambda f: f.loss) if possible else None
 
 
 def threshold(problem: Problem) -> float:
@@ -100,19 +104,14 @@ def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted | N
     rivals = [c for c in possible if c.gain > NEAR_RIVAL * possible[0].gain][:RIVALS]
     if possible[0].gain < 0.5 * ENOUGH:
         return None
-    trials = [
-        fitter.relax(fitted.problem, (*fitted.chosen, Chosen(c.form, c.shape)), rounds=2) for c in rivals
-    ]
+    trials = fitter.relaxed(fitted, [(*fitted.chosen, Chosen(c.form, c.shape)) for c in rivals])
     return min(trials, key=lambda f: f.loss)
 
 
 def _needed(fitter: Fitter, fitted: Fitted, enough: float) -> Fitted:
     """Leave out effects that the others, with shapes of their own, make needless."""
     while len(fitted.chosen) > 1:
-        smaller = [
-            fitter.relax(fitted.problem, without(fitted.chosen, k), rounds=2)
-            for k in range(len(fitted.chosen))
-        ]
+        smaller = fitter.relaxed(fitted, [without(fitted.chosen, k) for k in range(len(fitted.chosen))])
         weakest = min(smaller, key=lambda f: f.loss)
         if fitted.gain(weakest) > enough:
             break
@@ -130,7 +129,7 @@ def _alternatives(
         worse = [(c.form.name, float(np.log(c.cost / fitted.cost))) for c in others]
         near = [c for c, (_, w) in zip(others, worse, strict=True) if w < LOOKED_AT and not c.refused]
         rest = without(fitted.chosen, k)
-        refits = [fitter.relax(fitted.problem, (*rest, Chosen(c.form, c.shape)), rounds=2) for c in near]
+        refits = fitter.relaxed(fitted, [(*rest, Chosen(c.form, c.shape)) for c in near])
         alternatives.append(tuple(f for f in refits if f.loss - fitted.loss < AS_GOOD))
         rivals.append(tuple(sorted(worse, key=lambda w: w[1])))
     return tuple(alternatives), tuple(rivals)

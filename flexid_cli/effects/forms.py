@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flexid_cli.effects.motion import Shape
 from flexid_cli.effects.signature import CYCLES_PER_SPEED, POINTS_PER_CYCLE, Scale
+from flexid_cli.pipeline import filters
 
 Array = NDArray[np.float64]
 
@@ -44,20 +45,16 @@ def cycles_range(scale: Scale, name: str) -> Sequence[Shape] | None:
 
 def lagged(x: Array, lag_s: float, period_s: float) -> Array:
     """First-order lag of a signal that is linear between its samples, started at rest on its first value."""
-    from scipy.signal import lfilter
-
     decay = math.exp(-period_s / lag_s)
     share = lag_s / period_s * (1.0 - decay)
-    y, _ = lfilter([1.0 - share, share - decay], [1.0, -decay], x, zi=[share * x[0]])
-    return np.asarray(y, dtype=np.float64)
+    return filters.settled(x, np.array([[1.0 - share, share - decay, 0.0, 1.0, -decay, 0.0]]))
 
 
 def resonant(x: Array, frequency_hz: float, damping_ratio: float, period_s: float) -> Array:
     """(2 z w s + w^2) / (s^2 + 2 z w s + w^2) of a signal, by the bilinear transform that keeps w in its place."""
-    from scipy.signal import bilinear, lfilter, lfilter_zi
-
     w = 2.0 * math.pi * frequency_hz
-    half_rate = 0.5 * w / math.tan(0.5 * w * period_s)
-    b, a = bilinear([2.0 * damping_ratio * w, w * w], [1.0, 2.0 * damping_ratio * w, w * w], fs=half_rate)
-    y, _ = lfilter(b, a, x, zi=lfilter_zi(b, a) * x[0])
-    return np.asarray(y, dtype=np.float64)
+    c = w / math.tan(0.5 * w * period_s)  # s = c (z - 1) / (z + 1)
+    damping = 2.0 * damping_ratio * w * c
+    b = np.array([damping + w * w, 2.0 * w * w, w * w - damping])
+    a = np.array([c * c + damping + w * w, 2.0 * (w * w - c * c), c * c - damping + w * w])
+    return filters.settled(x, (np.concatenate([b, a]) / a[0])[None, :])

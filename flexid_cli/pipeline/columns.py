@@ -16,8 +16,6 @@ Array = NDArray[np.float64]
 
 SIGN_FILTER_ORDER = 2
 HALF_WIDTH = 3
-# Below this change of v / v0 within a sample the average is the value, to the change squared over 24.
-SLOW_CHANGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -186,14 +184,12 @@ def reversal(velocity: Array, width: float | None) -> Array:
     """
     if not width:
         return np.sign(velocity)
-    middle = np.concatenate([velocity[:1], 0.5 * (velocity[1:] + velocity[:-1]), velocity[-1:]]) / width
-    size = np.abs(middle)
-    integral = size + np.log1p(np.exp(-2.0 * size))
-    change = np.diff(middle)
-    smooth = np.abs(change) < SLOW_CHANGE
-    sign = np.where(smooth, np.tanh(velocity / width), np.diff(integral) / np.where(smooth, 1.0, change))
+    from flexid_cli.pipeline.loops import averaged_sign
+
+    sign = np.empty(velocity.size)
+    averaged_sign(np.ascontiguousarray(velocity), float(width), sign)
     sign[1:-1] -= np.diff(sign, 2) / 24.0
-    return np.asarray(sign, dtype=np.float64)
+    return sign
 
 
 _sign = reversal

@@ -115,6 +115,15 @@ def _settled_both_ways(x: Array, sos: Array) -> Array:
     return _both_ways(extended, sos, rest)[padding : padding + x.size].copy()
 
 
+def settled(x: Array, sos: Array) -> Array:
+    """Filter forward only, from the rest state of the first value."""
+    from flexid_cli.pipeline.cascade import filter_in_place
+
+    result = np.array(x, dtype=np.float64)
+    filter_in_place(result, sos, _rest_state(sos.tobytes(), sos.shape[0]), False)
+    return result
+
+
 def _both_ways(x: Array, sos: Array, rest: Array) -> Array:
     """The samples filtered in place, forward and then backward."""
     from flexid_cli.pipeline.cascade import filter_in_place

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.fft import next_fast_len
 
 from flexid_cli.diagnose.basis import solve
 from flexid_cli.diagnose.problem import Problem, Stretch
@@ -215,3 +216,11 @@ def test_a_steep_fall_is_continued_only_so_far():
     level, _ = _first_order(f, 1e6 / f**6)
     assert level == pytest.approx(MOST_FALL * np.median((1e6 / f**6)[:33]))
     assert _first_order(f, np.full(f.size, 3.0)) == (3.0, np.inf)
+
+
+@pytest.mark.parametrize("band", [7.3, 41.25, 123.4, 187.0])
+def test_the_number_of_rows_is_one_that_transforms_fast_and_costs_hardly_any_band(band):
+    taper = Taper.of(33_333, 1000.0, band, 48)
+    lines = taper.frequency_hz.size - 1
+    assert next_fast_len(lines) == lines
+    assert 0.97 * band < taper.frequency_hz[-1] <= band

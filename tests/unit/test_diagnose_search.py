@@ -9,7 +9,7 @@ import pytest
 
 from flexid_cli.diagnose.basis import Basis, solve
 from flexid_cli.diagnose.problem import Problem, Stretch
-from flexid_cli.diagnose.search import Candidate, Form, Search, gained, golden
+from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
 from flexid_cli.effects.motion import Base
 from flexid_cli.effects.registry import effect, effects
 from flexid_cli.estimate.budget import NoiseLevels
@@ -76,18 +76,38 @@ def values(search: Search, candidate: Candidate) -> dict[str, float]:
     return signature.values(candidate.amplitudes, candidate.shape, search.problem.base)
 
 
-def test_golden_section_closes_in_on_a_minimum():
+# Smooth, smooth and skew, with a corner as the instant of a change has one, and flat but for a dent.
+@pytest.mark.parametrize(
+    ("shape", "most"),
+    [
+        (lambda d: d**2, 6),
+        (lambda d: 1.0 - np.exp(-2.0 * d**2 * (1.0 + 0.3 * d)), 7),
+        (lambda d: np.abs(d) * (2.0 if d > 0.0 else 0.5), 12),
+        (lambda d: -np.exp(-((d / 0.2) ** 2)), 12),
+    ],
+)
+@pytest.mark.parametrize("place", [-0.83, -0.2, 0.0, 0.31, 0.77])
+def test_a_minimum_is_closed_in_on_with_few_points(shape, most, place):
     tried: list[float] = []
 
     def cost(x: float) -> float:
         tried.append(x)
-        return (x - 0.3) ** 2
+        return float(shape(x - place))
 
-    assert golden(cost, -1.0, 2.0, 20) == pytest.approx(0.3, abs=3.0 * 0.618**20)
-    assert len(tried) == 22
-    assert min(tried) > -1.0
-    assert max(tried) < 2.0
-    assert golden(lambda x: x, 0.0, 1.0, 12) < 0.01
+    x, least = minimum(cost, -1.0, 1.0, (-1.0, 0.0, 1.0), 0.002, 12)
+    assert least == min(shape(t - place) for t in tried) == shape(x - place)
+    assert x == pytest.approx(place, abs=0.012)
+    assert len(tried) <= 3 + most
+    assert min(tried) >= -1.0
+    assert max(tried) <= 1.0
+
+
+def test_a_minimum_at_the_edge_is_approached():
+    assert minimum(lambda x: x, 0.0, 1.0, (0.5,), 0.01, 12)[0] < 0.02
+
+
+def test_a_flat_function_has_its_minimum_anywhere():
+    assert minimum(lambda _: 1.0, 0.0, 1.0, (0.0, 0.5, 1.0), 0.01, 12)[1] == 1.0
 
 
 # Between the points of the coarse search and on them, over the whole range.
