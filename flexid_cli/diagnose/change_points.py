@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 ALPHA = 0.01  # chance of any change in a record that has none
 MOST = 4
-CANDIDATES = 600  # times that are tried
+PERIOD = 2  # rows in a period of the highest frequency, in which nothing can be timed
 EDGE = 0.03  # of the record, at either end, in which no change can be told
 LEAST_NEW = 0.01  # share of a column's largest part outside the others: less cannot be told from them
 LEAST_SHARE = 0.01  # of the residual's sum of squares, that a change explains
@@ -97,8 +97,16 @@ class _Best:
     profile: Array
 
 
-def changes(record: Record) -> tuple[Change, ...]:
-    """Changes of any column, the largest first; none where the residual's scores show none."""
+def changes(record: Record, rival: float = 0.0) -> tuple[Change, ...]:
+    """Changes of any column, the largest first; none where the residual's scores show none.
+
+    Parameters
+    ----------
+    record : Record
+    rival : float
+        Sum of squares that a function of another variable than time explains: where that is more than all changes
+        together do, a trajectory that changes its kind makes them up, and there are none.
+    """
     found: list[_Best] = []
     now, whole = record, max(float(record.residual @ record.residual), 1e-300)
     for _ in range(MOST):
@@ -113,6 +121,9 @@ def changes(record: Record) -> tuple[Change, ...]:
         now = now.without(_at(now, best))
         found.append(best)
     found = _kept(record, [_settled(record, found, k) for k in range(len(found))], whole)
+    left = _rest(record, found, len(found)).residual
+    if whole - float(left @ left) < rival:
+        return ()
     return tuple(_described(record, found, k, whole) for k in range(len(found)))
 
 
@@ -155,7 +166,7 @@ def _search(record: Record, name: str) -> _Best | None:
     """The best time for a change of one column, others free."""
     c, rows = record.columns[name], record.time_s.size
     edge = max(2, round(EDGE * rows))
-    at = np.unique(np.linspace(edge, rows - edge, CANDIDATES).astype(np.intp))
+    at = np.arange(edge, rows - edge)
     products = record.by_time(c[:, None] * np.column_stack([record.Q, record.residual, c]))
     after = np.cumsum(products[::-1], axis=0)[::-1]
     total, sums, late = after[0], after[at], 1.0 - at / rows
@@ -195,7 +206,7 @@ def _scores_spread(record: Record, weight: Array, change: Array) -> Spread:
 
 
 def _rest(record: Record, found: Sequence[_Best], k: int) -> Record:
-    """The record without all changes but the k-th."""
+    """The record without all changes but the k-th, if there is one."""
     for i, b in enumerate(found):
         if i != k:
             record = record.without(_at(record, b))
@@ -221,8 +232,8 @@ def _described(record: Record, found: Sequence[_Best], k: int, whole: float) -> 
     return Change(
         column=best.name,
         time_s=float(record.time_s[best.row]),
-        earliest_s=float(record.time_s[best.rows[near[0]]]),
-        latest_s=float(record.time_s[best.rows[near[-1]]]),
+        earliest_s=float(record.time_s[max(best.rows[near[0]] - PERIOD, 0)]),
+        latest_s=float(record.time_s[min(best.rows[near[-1]] + PERIOD, record.time_s.size - 1)]),
         size=float(P @ rest.residual) / size,
         stderr=error / size,
         share=best.explained / whole,

@@ -267,7 +267,7 @@ class _Report:
         left = self.verdict == "partly_explained"
         fitted, maps = (self.selection.after, self.remaining) if left else (self.selection.before, self.maps)
         model = "with the named effects" if left else "baseline"
-        found = locality(fitted, self.recording, after if left else before, model)
+        found = locality(fitted, maps, self.recording, after if left else before, model)
         if not maps:
             return None, found
         where = located(maps[0], fitted.problem, fitted.basis, self.recording)

@@ -14,6 +14,7 @@ from flexid_cli.diagnose.drift import drifts
 from flexid_cli.diagnose.events import events
 from flexid_cli.diagnose.evidence import by_equation
 from flexid_cli.diagnose.fitter import Fitted
+from flexid_cli.diagnose.location import Map
 from flexid_cli.diagnose.loop_width import loop_width
 from flexid_cli.diagnose.physical import torque_scale
 from flexid_cli.diagnose.problem import Problem
@@ -35,12 +36,16 @@ _COLUMNS: dict[str, Callable[[Motion], Terms]] = {
 }
 
 
-def locality(fitted: Fitted, recording: Recording, estimates: Sequence[Estimate], model: str) -> Locality:
+def locality(
+    fitted: Fitted, maps: Sequence[Map], recording: Recording, estimates: Sequence[Estimate], model: str
+) -> Locality:
     """Where and when a model's residual lives.
 
     Parameters
     ----------
     fitted : Fitted
+    maps : sequence of Map
+        Of its residual.
     recording : Recording
         For units.
     estimates : sequence of Estimate
@@ -51,7 +56,7 @@ def locality(fitted: Fitted, recording: Recording, estimates: Sequence[Estimate]
     record, torque = change_record(fitted), recording.torque_unit
     values = {e.symbol: e.value for e in estimates if e.value is not None}
     units = {e.symbol: e.unit for e in estimates} | {"torque_scale": "1"}
-    found = tuple(replace(c, unit=units.get(c.column, torque)) for c in changes(record))
+    found = tuple(replace(c, unit=units.get(c.column, torque)) for c in changes(record, _rival(fitted, maps)))
     drift = tuple(replace(d, unit=units.get(d.column, torque)) for d in drifts(record, values))
     stiffness = f"{torque}/{'m' if recording.linear else 'rad'}"
     return Locality(
@@ -65,6 +70,12 @@ def locality(fitted: Fitted, recording: Recording, estimates: Sequence[Estimate]
     )
 
 
+def _rival(fitted: Fitted, maps: Sequence[Map]) -> float:
+    """Sum of squares that the best function of another variable than time explains; see `gained`."""
+    gain = max((m.gain for m in maps if not m.variable.startswith(("time", "frequency"))), default=0.0)
+    return (fitted.cost + fitted.y.size) * -float(np.expm1(-gain))
+
+
 def lengths(problem: Problem) -> list[int]:
     """Rows of each gap-free stretch."""
     return [w.seconds.size for w in problem.weights]
@@ -74,9 +85,12 @@ def change_record(fitted: Fitted) -> Record:
     """The residual with the columns of the baseline, offsets and the torque's factor."""
     problem, basis = fitted.problem, fitted.basis
     columns = {name: basis.columns[:, k] for k, name in enumerate(problem.names)}
-    offsets = [n for n in ("motor_offset", "load_offset") if n == "motor_offset" or problem.both]
+    offsets = ["motor_offset", "load_offset"] if problem.both else ["motor_offset"]
+    offsets = [] if "offset" in columns else offsets
     for name in (*offsets, "torque_scale", *(("K",) if problem.both else ())):
         columns[name] = problem.effect_rows(_COLUMNS[name])[0][:, 0]
+    if not offsets:
+        return Record(columns, basis.Q, basis.residual, problem.row_times, lengths(problem))
     added = basis.outside(np.column_stack([columns[n] for n in offsets]))
     U, s, _ = np.linalg.svd(added / np.maximum(np.linalg.norm(added, axis=0), 1e-300), full_matrices=False)
     U = U[:, s > 1e-6 * s[0]]

@@ -44,6 +44,7 @@ def figure_reversals(found: list[Reversals]) -> str:
             axes.axhline(0.0, color=MEASURED, linewidth=0.6)
             axes.axvline(0.0, color=MEASURED, linewidth=0.6)
             axes.plot(one.lag_s, one.mean, color=PREDICTED, linewidth=1.4, label="mean")
+            axes.locator_params(axis="x", nbins=5)
             axes.set_xlabel("time from the reversal (s)")
             axes.set_ylabel(f"{one.equation} residual ({one.unit})")
             legend(axes, columns=2)

@@ -117,9 +117,11 @@ def line_rows(found: Mapping[str, Any]) -> Rows:
 
 
 def loop_rows(found: Mapping[str, Any]) -> Rows:
-    """Frequency, loss stiffness, half width of its band, loop's width."""
+    """Frequency, loss stiffness, half width of its band, loop's width; nothing where no band shows a loop."""
     loop = found["loop"]
-    if loop is None:
+    if loop is None or not any(
+        None not in (x, half) and x > half for x, half in zip(loop["stiffness"], loop["band"], strict=True)
+    ):
         return []
     cells = zip(loop["frequency_hz"], loop["stiffness"], loop["band"], loop["width"], strict=True)
     return [tuple(_number(x) for x in row) for row in cells]

@@ -115,6 +115,13 @@ def test_two_changes_that_undo_each_other_are_an_interval():
     assert (start, end) == (pytest.approx(10.0, abs=0.6), pytest.approx(20.0, abs=0.6))
 
 
+def test_what_another_variable_explains_better_is_no_change():
+    one = record(5, {"JL": 0.6 * (TIME >= 20.0)})
+    explained = changes(one)[0].share * float(one.residual @ one.residual)
+    assert len(changes(one, rival=0.9 * explained)) == 1
+    assert changes(one, rival=1.1 * explained) == ()
+
+
 @pytest.mark.parametrize("pole", [0.0, 0.9])
 def test_nothing_changes_in_coloured_noise_more_often_than_stated(pole):
     found = [bool(changes(record(seed, pole=pole))) for seed in range(100)]
