@@ -10,11 +10,19 @@ from types import SimpleNamespace
 import numpy as np
 
 from flexid_cli.diagnose.result import (
+    AngleLine,
+    AngleSpectrum,
+    Change,
     Diagnosis,
+    Drift,
+    Event,
     Evidence,
     HeldOut,
+    Locality,
+    LoopWidth,
     NamedEffect,
     ResidualMap,
+    Reversals,
     Shape,
     SimulationError,
     Tested,
@@ -88,6 +96,36 @@ def shape():
     return Shape(x, y, y - 0.6, y + 0.6, "rad", "N.m")
 
 
+def locality(model="baseline"):
+    """Something of every kind."""
+    lag, cycles = np.linspace(-0.1, 0.1, 21), np.linspace(5.0, 200.0, 120)
+    lines = (
+        AngleLine(2.0, 100.0, 3.2, 0.08, 0.31, -1.2, 1e-9),
+        AngleLine(0.46, 23.0, 1.1, 0.08, 0.04, 0.3, 0.002),
+    )
+    mean = 4.0 * np.tanh(lag / 0.02)
+    turned = Reversals("load", 41, 0.22, 0.71, 0.66, 0.76, 1e-6, lag, mean, np.full(21, 0.4), "N.m")
+    hardly = replace(turned, equation="motor", energy_share=0.23, low=0.17, high=0.29, p_value=0.4)
+    amplitude = 0.2 + 3.0 * np.exp(-(((cycles - 100.0) / 3.0) ** 2))
+    frequency = np.array([0.4, 1.2, 3.6, 10.8])
+    stiffness = np.array([61.0, 58.0, 66.0, 60.0])
+    return Locality(
+        model,
+        changes=(Change("JL", 17.31, 17.28, 17.36, 4.12, 0.07, 0.63, 1e-12, ("MY",), "kg.m2"),),
+        events=(Event("load", 31.2, 31.4, 212.0, 0.02),),
+        reversals=(hardly, turned),
+        angle=(AngleSpectrum("motor", cycles, amplitude, np.full(120, 0.6), lines, "N.m"),),
+        loop=LoopWidth(
+            frequency, stiffness, np.array([20.0, 6.0, 2.0, 3.0]), np.full(4, 2e-3), 4e-3 * stiffness,
+            0.02, 0.05, 0.31, "N.m/rad", "N.m",
+        ),
+        drift=(
+            Drift("FVm", -3.1, 0.4, -1.3, 0.08, 1e-5, "N.m.s/rad"),
+            Drift("load_offset", 0.1, 0.1, None, 1e-5, 0.9, "N.m"),
+        ),
+    )  # fmt: skip
+
+
 def explained():
     return Diagnosis(
         verdict="explained",
@@ -137,6 +175,7 @@ def pair():
         verdict="partly_explained",
         effects=(BACKLASH, friction),
         location=Where("load", "position"),
+        locality=locality("with the named effects"),
     )
 
 
@@ -146,7 +185,18 @@ def unexplained():
         verdict="unexplained",
         sentence="Something that is not in the library acts in the load equation, over the position.",
         effects=(),
-        location=Where("load", "position", None, (0.1, 2.0), shape()),
+        location=Where(
+            "load",
+            "position",
+            (17.31, 99.9),
+            (0.1, 2.0),
+            shape(),
+            (
+                "from 17.31 s on the load's inertia differs by +4.12 kg.m2",
+                "it stands at the upper end of the travel",
+            ),
+        ),
+        locality=locality(),
         parameters_after=BEFORE,
         tested=tuple(replace(t, reason=t.reason or "explains too little") for t in TESTED),
     )
@@ -161,6 +211,7 @@ def adequate():
         parameters_after=BEFORE,
         tested=(),
         maps=(),
+        locality=locality(),
     )
 
 

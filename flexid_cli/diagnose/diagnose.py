@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,23 +11,27 @@ from numpy.typing import NDArray
 
 from flexid_cli.diagnose import evidence, verdict
 from flexid_cli.diagnose.estimates import Solved, base_estimates, effect_estimates, solved
-from flexid_cli.diagnose.figures import residual_map, traces
+from flexid_cli.diagnose.figures import matter, residual_map, traces
 from flexid_cli.diagnose.fitter import Fitted, Fitter
+from flexid_cli.diagnose.locality import locality
 from flexid_cli.diagnose.location import Map, located, residual_maps
 from flexid_cli.diagnose.physical import torque_scale
 from flexid_cli.diagnose.result import (
     Diagnosis,
     Evidence,
     HeldOut,
+    Locality,
     NamedEffect,
     SimulationError,
     Tested,
+    Verdict,
     Where,
 )
 from flexid_cli.diagnose.search import Candidate, Form
 from flexid_cli.diagnose.selection import Selection, select, threshold
 from flexid_cli.diagnose.simulation import simulation_error
 from flexid_cli.diagnose.start import first_problems, has_joint
+from flexid_cli.diagnose.suggest import interval, suggestions
 from flexid_cli.effects.base import EffectValues
 from flexid_cli.effects.registry import effects as library
 from flexid_cli.estimate.result import Estimate
@@ -133,14 +138,16 @@ class _Report:
         alternatives = [f for group in self.selection.alternatives for f in group] if named else []
         alternatives += self.selection.elsewhere
         parameters_after = self._base_parameters(after, solved_after, doubt, alternatives)
-        place = self._place()
+        place, where = self._place(parameters_before, parameters_after)
         share = 1.0 - max(after.cost - after.y.size, 0.0) / max(before.cost - before.y.size, 1e-300)
         equation, variable = (place.equation, place.variable) if place else ("motor", "velocity")
         return Diagnosis(
             verdict=self.verdict,
-            sentence=verdict.sentence(self.verdict, named, equation, variable, share),
+            sentence=_with_suggestion(
+                verdict.sentence(self.verdict, named, equation, variable, share), place, self.verdict
+            ),
             model=before.problem.model,
-            effects=named,
+            effects=_timed(named, place),
             location=place if self.verdict in ("unexplained", "partly_explained") else None,
             held_out=self._held_out(*self.unseen),
             simulation=self._simulation(parameters_before, parameters_after),
@@ -152,7 +159,11 @@ class _Report:
             ),
             notes=(*self._notes(), *self._contradicted(parameters_after)),
             traces=traces(before, after, self.recording.torque_unit),
-            maps=tuple(residual_map(before, after, m, self.recording) for m in self.maps[:1]),
+            maps=tuple(
+                residual_map(before, after, m, self.recording)
+                for m in matter(self.maps, both=before.problem.both)
+            ),
+            locality=where,
         )
 
     def _doubt(self) -> str:
@@ -251,9 +262,17 @@ class _Report:
             position_unit="m" if self.recording.linear else "rad",
         )
 
-    def _place(self) -> Where | None:
-        maps = self.remaining if self.verdict == "partly_explained" else self.maps
-        return located(maps[0], self.recording) if maps else None
+    def _place(self, before: Sequence[Estimate], after: Sequence[Estimate]) -> tuple[Where | None, Locality]:
+        """Where the mismatch is, or what the named effects leave of it, and every view of that."""
+        left = self.verdict == "partly_explained"
+        fitted, maps = (self.selection.after, self.remaining) if left else (self.selection.before, self.maps)
+        model = "with the named effects" if left else "baseline"
+        found = locality(fitted, maps, self.recording, after if left else before, model)
+        if not maps:
+            return None, found
+        where = located(maps[0], fitted.problem, fitted.basis, self.recording)
+        where = replace(where, interval=interval(found, float(fitted.problem.row_times[-1])))
+        return replace(where, suggests=suggestions(where, found, maps[0].gain)), found
 
     def _tested(self) -> tuple[Tested, ...]:
         met = {c.form.name: c for c in self.selection.tested}
@@ -318,6 +337,21 @@ class _Report:
                 f"the torque fits best as measured at its stamp, not held: signals.{role}.hold: instant"
             )
         return tuple(notes)
+
+
+def _timed(named: tuple[NamedEffect, ...], place: Where | None) -> tuple[NamedEffect, ...]:
+    """One effect alone acts when the whole mismatch does."""
+    if len(named) != 1 or place is None or place.interval is None:
+        return named
+    return (replace(named[0], where=replace(named[0].where, interval=place.interval)),)
+
+
+def _with_suggestion(text: str, place: Where | None, verdict: Verdict) -> str:
+    """The sentence, with what the place of something unknown suggests."""
+    if verdict != "unexplained" or place is None or not place.suggests:
+        return text
+    first = place.suggests[0]
+    return f"{text} {first[0].upper()}{first[1:]}."
 
 
 def _variable(equation: str, maps: list[Map]) -> str:

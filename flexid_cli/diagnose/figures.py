@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from flexid_cli.diagnose.bands import binned
 from flexid_cli.diagnose.evidence import by_equation
 from flexid_cli.diagnose.fitter import Fitted
 from flexid_cli.diagnose.location import VARIABLES, Map, unit_of_variable
@@ -15,8 +18,9 @@ from flexid_cli.signals.recording import Recording
 Array = NDArray[np.float64]
 
 BINS = 24
-BLOCK_S = 1.0  # blocks that the bands' spread is taken over
 LEAST_IN_BIN = 5
+MOST_MAPS = 4
+LEAST_SHARE, LEAST_GAIN = 0.25, 0.05  # gain of a further map: of the largest, and at all
 
 
 def traces(before: Fitted, after: Fitted, unit: str) -> Traces:
@@ -42,23 +46,26 @@ def residual_map(before: Fitted, after: Fitted, found: Map, recording: Recording
     size = torque_scale(before.problem)[equation]
     first = size * by_equation(before.problem, before.basis.residual)[equation]
     last = size * by_equation(after.problem, after.basis.residual)[equation]
-    rows = [k for k in range(BINS) if np.count_nonzero(which == k) >= LEAST_IN_BIN]
+    bins = [k for k in range(BINS) if np.count_nonzero(which == k) >= LEAST_IN_BIN]
+    rows = [w.seconds.size for w in before.problem.weights]
+    after_mean, band = binned(last, which, bins, rows)
     return ResidualMap(
         equation=equation,
         variable=variable.split("_times_")[0],
-        x=np.array([0.5 * (edges[k] + edges[k + 1]) for k in rows]),
-        before=np.array([first[which == k].mean() for k in rows]),
-        after=np.array([last[which == k].mean() for k in rows]),
-        band=np.array([_band(last[which == k], t[which == k]) for k in rows]),
+        x=np.array([0.5 * (edges[k] + edges[k + 1]) for k in bins]),
+        before=np.array([first[which == k].mean() for k in bins]),
+        after=after_mean,
+        band=band,
         x_unit=unit_of_variable(variable, recording),
         unit=recording.torque_unit,
     )
 
 
-def _band(values: Array, t: Array) -> float:
-    """Half width of a 95 % band of a mean, from the means of blocks of time."""
-    block = np.floor(t / BLOCK_S)
-    means = np.array([values[block == b].mean() for b in np.unique(block)])
-    if means.size < 2:
-        return float(1.96 * values.std())
-    return float(1.96 * means.std(ddof=1) / np.sqrt(means.size))
+def matter(maps: Sequence[Map], *, both: bool) -> list[Map]:
+    """The maps to show: the largest, and others that explain a good part of what it does; no figure twice."""
+    shown: dict[tuple[bool, str], Map] = {}
+    for m in maps:
+        key = (both and m.equation != "motor", m.variable.split("_times_")[0].replace("frequency", "time"))
+        if len(shown) < MOST_MAPS and (m is maps[0] or m.gain >= max(LEAST_SHARE * maps[0].gain, LEAST_GAIN)):
+            shown.setdefault(key, m)
+    return list(shown.values())

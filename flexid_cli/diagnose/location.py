@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flexid_cli.diagnose.bands import correlated_rows, spread
 from flexid_cli.diagnose.basis import Basis
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.result import Shape, Where
@@ -154,6 +155,14 @@ def _map(problem: Problem, now: Basis, equation: str, variable: str) -> Map:
     value, factor = VARIABLES[variable]
     x = np.concatenate([value(m, equation) for m in problem.motions])
     knots = _knots(x, variable)
+    C = _columns(problem, equation, variable, knots)
+    gain, values, errors = _explained(C, now)
+    return Map(equation, variable, gain, knots, values, errors, plain=factor is _one)
+
+
+def _columns(problem: Problem, equation: str, variable: str, knots: Array) -> Array:
+    """Rows of the free function's columns, shape (r, knots)."""
+    value, factor = VARIABLES[variable]
 
     def terms(m: Motion) -> Terms:
         return Terms(**{equation: hats(value(m, equation), knots) * factor(m, equation)[:, None]})
@@ -161,10 +170,9 @@ def _map(problem: Problem, now: Basis, equation: str, variable: str) -> Map:
     C, _ = problem.effect_rows(terms)
     if factor is _torque:
         # The torque is what is explained: only how its factor varies is free, not the factor itself.
-        weight = hats(x, knots).mean(axis=0)
-        C = C - np.outer(C.sum(axis=1), weight)
-    gain, values, errors = _explained(C, now)
-    return Map(equation, variable, gain, knots, values, errors, plain=factor is _one)
+        x = np.concatenate([value(m, equation) for m in problem.motions])
+        C = C - np.outer(C.sum(axis=1), hats(x, knots).mean(axis=0))
+    return C
 
 
 def _knots(x: Array, variable: str) -> Array:
@@ -178,15 +186,31 @@ def _knots(x: Array, variable: str) -> Array:
 
 
 def _explained(C: Array, now: Basis) -> tuple[float, Array, Array]:
+    U, heights = _solved(C, now)
+    z = U.T @ now.residual
+    errors = now.rms * np.linalg.norm(heights, axis=1)
+    return gained(now.cost, now.cost - float(z @ z), now.residual.size), heights @ z, errors
+
+
+def _solved(C: Array, now: Basis) -> tuple[Array, Array]:
+    """Orthonormal basis U of columns outside the model's, and what turns U' e into their coefficients."""
     P = C - now.Q @ (now.Q.T @ C)
     size = np.linalg.norm(C, axis=0)
     size[size == 0.0] = 1.0
     U, s, Vt = np.linalg.svd(P / size, full_matrices=False)
     keep = s > 1e-4 * max(s[0], 1e-300)
-    z = U[:, keep].T @ now.residual
-    values = (Vt[keep].T @ (z / s[keep])) / size
-    errors = now.rms * np.linalg.norm(Vt[keep].T / s[keep], axis=1) / size
-    return gained(now.cost, now.cost - float(z @ z), now.residual.size), values, errors
+    return U[:, keep], Vt[keep].T / s[keep] / size[:, None]
+
+
+def _half_width(problem: Problem, now: Basis, found: Map) -> Array:
+    """Half width of the 95 % band of a map's function, by the block bootstrap."""
+    U, heights = _solved(_columns(problem, found.equation, found.variable, found.knots), now)
+    left = now.residual - U @ (U.T @ now.residual)
+    rows, lengths = problem.row_times.size, [w.seconds.size for w in problem.weights]
+    # What each instant adds to each height, equations added.
+    parts = (left[:, None] * (U @ heights.T)).reshape(-1, rows, found.knots.size).sum(axis=0)
+    block = max(correlated_rows(e, lengths) for e in left.reshape(-1, rows))
+    return spread(parts, lengths, block).half_width()
 
 
 def _lines(problem: Problem, now: Basis) -> Iterator[Map]:
@@ -244,11 +268,11 @@ def chirp_transform(x: Array, first: float, step: float, count: int) -> NDArray[
     return np.asarray(chirp(k) * sums[x.size - 1 : x.size - 1 + count])
 
 
-def located(found: Map, recording: Recording) -> Where:
-    """Place of a mismatch: equation, variable, and its shape there with 95 % bands."""
+def located(found: Map, problem: Problem, now: Basis, recording: Recording) -> Where:
+    """Place of a mismatch: equation, variable, and its shape there with 95 % bands of the block bootstrap."""
     shape = None
     if found.knots.size > 1:
-        half = 1.96 * found.errors
+        half = _half_width(problem, now, found)
         unit = recording.torque_unit if found.plain else "1"
         shape = Shape(
             found.knots,

@@ -42,6 +42,8 @@ class Where:
         Band that holds most of it.
     shape : Shape or None
         As a function of the variable.
+    suggests : tuple of str
+        What shape, time and lines suggest, in words; no name of an effect.
     """
 
     equation: str
@@ -49,6 +51,7 @@ class Where:
     interval: tuple[float, float] | None = None
     frequency_hz: tuple[float, float] | None = None
     shape: Shape | None = None
+    suggests: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -156,6 +159,223 @@ class ResidualMap:
 
 
 @dataclass(frozen=True)
+class Change:
+    """A time from which on another factor of one column of the model fits.
+
+    Attributes
+    ----------
+    column : str
+        Symbol of a parameter of the baseline, or ``motor_offset``, ``load_offset``, ``torque_scale``.
+    time_s, earliest_s, latest_s : float
+        When, with a 95 % interval, from the record's start.
+    size, stderr : float
+        Change of the factor, in ``unit``.
+    share : float
+        Of the residual's sum of squares, what the change explains.
+    p_value : float
+        Corrected for the number of columns.
+    alternatives : tuple of str
+        Columns whose change explains nearly as much.
+    unit : str
+    """
+
+    column: str
+    time_s: float
+    earliest_s: float
+    latest_s: float
+    size: float
+    stderr: float
+    share: float
+    p_value: float
+    alternatives: tuple[str, ...] = ()
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Event:
+    """A burst of residual energy far above what the rest of the record shows.
+
+    Attributes
+    ----------
+    equation : str
+    start_s, end_s : float
+        From the record's start.
+    times_usual : float
+        Energy over the median's.
+    share : float
+        Of the equation's sum of squares.
+    """
+
+    equation: str
+    start_s: float
+    end_s: float
+    times_usual: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Reversals:
+    """The residual about an equation's velocity reversals.
+
+    Attributes
+    ----------
+    equation : str
+    count : int
+        Reversals.
+    time_share : float
+        Share of the rows that lie within the window.
+    energy_share, low, high : float
+        Share of the residual's sum of squares there, with 95 % band.
+    p_value : float
+        Of an energy share that is no larger than the time's.
+    lag_s, mean, band : ndarray
+        Mean residual over the time from the reversal, folded by the direction after it, in ``unit``, and the half
+        width of its 95 % band.
+    unit : str
+    """
+
+    equation: str
+    count: int
+    time_share: float
+    energy_share: float
+    low: float
+    high: float
+    p_value: float
+    lag_s: Array
+    mean: Array
+    band: Array
+    unit: str
+
+
+@dataclass(frozen=True)
+class AngleLine:
+    """A ripple of fixed period over the motor's angle.
+
+    Attributes
+    ----------
+    cycles_per_motor_revolution, cycles_per_joint_revolution : float
+    amplitude, stderr : float
+        In torque units.
+    share : float
+        Of the equation's sum of squares, what the line explains.
+    phase : float
+        rad: amplitude cos(cycles x angle + phase), at the joint's angle zero.
+    false_alarm : float
+        Chance that noise of the spectrum's level shows such a line anywhere among those searched.
+    """
+
+    cycles_per_motor_revolution: float
+    cycles_per_joint_revolution: float
+    amplitude: float
+    stderr: float
+    share: float
+    phase: float
+    false_alarm: float
+
+
+@dataclass(frozen=True)
+class AngleSpectrum:
+    """Spectrum of an equation's residual over the motor's angle.
+
+    Attributes
+    ----------
+    equation : str
+    cycles : ndarray
+        Per joint revolution.
+    amplitude, level : ndarray
+        Of a line there, and the level that noise exceeds anywhere in one of a hundred records; in ``unit``.
+    lines : tuple of AngleLine
+        Strongest first.
+    unit : str
+    """
+
+    equation: str
+    cycles: Array
+    amplitude: Array
+    level: Array
+    lines: tuple[AngleLine, ...]
+    unit: str
+
+
+@dataclass(frozen=True)
+class LoopWidth:
+    """Width of the loop of torque over torsion in bands of frequency.
+
+    Attributes
+    ----------
+    frequency_hz : ndarray, shape (k,)
+    stiffness, band : ndarray, shape (k,)
+        Torque in quadrature to the torsion over the torsion (loss stiffness), and half width of its 95 % band.
+    torsion, width : ndarray, shape (k,)
+        Amplitude of the torsion in the band, and the loop's width in torque at zero torsion.
+    slope, slope_stderr : float or None
+        Of log stiffness over log frequency: zero where the loop does not depend on the rate, one where it is viscous.
+        None where too few bands show a loop.
+    share : float
+        Of the residual's sum of squares, what the loops explain.
+    unit, torque_unit : str
+    """
+
+    frequency_hz: Array
+    stiffness: Array
+    band: Array
+    torsion: Array
+    width: Array
+    slope: float | None
+    slope_stderr: float | None
+    share: float
+    unit: str
+    torque_unit: str
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Trend of one parameter over the record.
+
+    Attributes
+    ----------
+    column : str
+        As `Change`.
+    per_minute, stderr : float
+        In ``unit`` a minute.
+    percent_per_minute : float or None
+        Of the parameter.
+    share : float
+        Of the residual's sum of squares, what the trend explains.
+    p_value : float
+        Corrected for the number of columns.
+    unit : str
+    """
+
+    column: str
+    per_minute: float
+    stderr: float
+    percent_per_minute: float | None
+    share: float
+    p_value: float
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Locality:
+    """Where and when the mismatch of one model with the record shows, by every view of it.
+
+    Attributes
+    ----------
+    model : {"baseline", "with the named effects"}
+        Whose residual it is.
+    """
+
+    model: str
+    changes: tuple[Change, ...] = ()
+    events: tuple[Event, ...] = ()
+    reversals: tuple[Reversals, ...] = ()
+    angle: tuple[AngleSpectrum, ...] = ()
+    loop: LoopWidth | None = None
+    drift: tuple[Drift, ...] = ()
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """Outcome of a diagnosis.
 
@@ -176,6 +396,8 @@ class Diagnosis:
     next_recording : tuple of str
         What to record to decide what this record cannot.
     notes : tuple of str
+    locality : Locality or None
+        Time, events, reversals, angle, loop and drift of the mismatch.
     traces, maps : for figures
     """
 
@@ -193,3 +415,4 @@ class Diagnosis:
     notes: tuple[str, ...]
     traces: Traces | None = None
     maps: tuple[ResidualMap, ...] = field(default=())
+    locality: Locality | None = None

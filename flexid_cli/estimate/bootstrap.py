@@ -137,14 +137,16 @@ def _optimal(x: Array, lengths: Sequence[int]) -> float:
 
 def _autocovariances(x: Array, lengths: Sequence[int], most: int) -> Array:
     """R(0) to R(most), products across gaps left out."""
+    from scipy.fft import irfft, next_fast_len, rfft
+
     centred = x - x.mean()
     spans = [slice(a, b) for a, b in pairwise(accumulate(lengths, initial=0))]
     most = min(most, max(lengths) - 1)
     total = np.zeros(most + 1)
     for span in spans:
         part = centred[span]
-        spectrum = np.fft.rfft(part, 2 * part.size)
-        products = np.fft.irfft(np.abs(spectrum) ** 2)[: min(most + 1, part.size)]
+        size = next_fast_len(2 * part.size, real=True)
+        products = irfft(np.abs(rfft(part, size)) ** 2, size)[: min(most + 1, part.size)]
         total[: products.size] += products
     return np.asarray(total / x.size, dtype=np.float64)
 
@@ -161,6 +163,18 @@ def block_spread(parts: Array, lengths: Sequence[int], block: int, draws: int = 
     block, draws : int
         Rows of a block, and number of bootstrap records.
     """
+    blocks, mean_length = block_sums(parts, lengths, block)
+    count = max(1, round(blocks.shape[0] / mean_length))
+    rng = np.random.default_rng(SEED)
+    drawn = np.empty((draws, parts.shape[1]))
+    for i in range(draws):
+        drawn[i] = blocks[rng.integers(blocks.shape[0], size=count)].sum(axis=0)
+    drawn *= np.sqrt(blocks.shape[0] / (count * mean_length))
+    return np.asarray(np.std(drawn, axis=0, ddof=1), dtype=np.float64)
+
+
+def block_sums(parts: Array, lengths: Sequence[int], block: int) -> tuple[Array, float]:
+    """Sums of each series over every block, and the blocks' mean length; parameters as in `block_spread`."""
     centred = parts - parts.mean(axis=0)
     sums, size = [], 0
     for a, b in pairwise(accumulate(lengths, initial=0)):
@@ -170,14 +184,7 @@ def block_spread(parts: Array, lengths: Sequence[int], block: int, draws: int = 
         sums.append((total[length:] - total[:-length])[: b - a])
         size += length * (b - a)
     blocks = np.concatenate(sums)
-    mean_length = size / blocks.shape[0]
-    count = max(1, round(blocks.shape[0] / mean_length))
-    rng = np.random.default_rng(SEED)
-    drawn = np.empty((draws, parts.shape[1]))
-    for i in range(draws):
-        drawn[i] = blocks[rng.integers(blocks.shape[0], size=count)].sum(axis=0)
-    drawn *= np.sqrt(blocks.shape[0] / (count * mean_length))
-    return np.asarray(np.std(drawn, axis=0, ddof=1), dtype=np.float64)
+    return blocks, size / blocks.shape[0]
 
 
 def _refit_spread(solution: Solution, block: int) -> Array | None:

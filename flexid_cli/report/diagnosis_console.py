@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from flexid_cli.report import diagnosis_words as say
-from flexid_cli.report import words
+from flexid_cli.report import locality_words, words
 from flexid_cli.report.lines import Line, Table, estimates, fitting
 from flexid_cli.report.numbers import MISSING
 
@@ -32,6 +32,7 @@ def diagnosis_lines(document: Mapping[str, Any], width: int) -> Iterator[Line]:
     left = say.left_sentence(diagnosis)
     if left:
         yield from (Line(""), Line(left))
+    yield from _locality(diagnosis)
     yield from _parameters(diagnosis, width)
     side = words.side_sentence(document)
     if side and (diagnosis["parameters_before"] or diagnosis["parameters_after"]):
@@ -82,6 +83,14 @@ def _percent(gain: float | None) -> str:
 def _reasons(parameters: Sequence[Mapping[str, Any]]) -> Iterator[Line]:
     for name, verdict, reason in words.reasons(parameters):
         yield Line(f"{name} ({verdict}): {reason}")
+
+
+def _locality(diagnosis: Mapping[str, Any]) -> Iterator[Line]:
+    found = locality_words.sentences(diagnosis)
+    if found:
+        yield Line("")
+        yield Line(f"Where and when it shows. {locality_words.introduction(diagnosis)}")
+        yield from (Line(f"- {text}") for text in found)
 
 
 def _parameters(diagnosis: Mapping[str, Any], width: int) -> Iterator[Line]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from flexid_cli.report import diagnosis_words as say
-from flexid_cli.report import words
+from flexid_cli.report import locality_words, words
 from flexid_cli.report.markdown_text import bullets, escape, estimates, table
 from flexid_cli.report.numbers import MISSING
 
@@ -34,6 +34,7 @@ def diagnosis_blocks(document: Mapping[str, Any], figures: Mapping[str, str]) ->
         f"Verdict: *{say.phrase(diagnosis['verdict'])}*: {meaning}. Model: {escape(diagnosis['model'])}.",
         *_found(diagnosis),
         *_left(diagnosis),
+        *_locality(diagnosis),
         *_parameters(diagnosis),
         *([escape(side)] if side else []),
         *_fit(diagnosis),
@@ -87,6 +88,49 @@ def _left(diagnosis: Mapping[str, Any]) -> Iterator[str]:
         curves = zip(shape["x"], shape["y"], shape["low"], shape["high"], strict=True)
         rows = [(say.rounded(x), say.rounded(y), _band(low, high)) for x, y, low, high in curves]
         yield table(titles, "rrr", rows)
+
+
+def _locality(diagnosis: Mapping[str, Any]) -> Iterator[str]:
+    found = locality_words.shown(diagnosis)
+    if found is None:
+        return
+    yield "## Where and when it shows"
+    told = locality_words.sentences(diagnosis)
+    yield escape(locality_words.introduction(diagnosis)) + (
+        "" if told else " It is the same all over the record."
+    )
+    if told:
+        yield bullets(escape(text) for text in told)
+    loop = found["loop"]
+    stiffness, width = ("", "") if loop is None else (loop["unit"], loop["torque_unit"])
+    tables = (
+        (
+            ("Changes", "From (s)", "95 % interval (s)", "By", "Unit", "Explains %", "Nearly as well"),
+            "lrrrlrl",
+            locality_words.change_rows(found),
+        ),
+        (
+            ("Lines", "Per motor revolution", "Per joint revolution", "Amplitude", "Unit", "Explains %",
+             "Phase (rad)", "Chance of noise"),
+            "lrrrlrrr",
+            locality_words.line_rows(found),
+        ),
+        (
+            ("Loop at (Hz)", f"Loss stiffness ({stiffness})", "95 % band, ±", f"Width ({width})"),
+            "rrrr",
+            locality_words.loop_rows(found),
+        ),
+        (
+            ("Drift", "A minute", "Standard error", "Unit", "% a minute", "Explains %", "p"),
+            "lrrlrrr",
+            locality_words.drift_rows(found),
+        ),
+    )  # fmt: skip
+    yield from (
+        table([escape(t) for t in titles], align, [tuple(escape(c) for c in row) for row in rows])
+        for titles, align, rows in tables
+        if rows
+    )
 
 
 def _band(low: float | None, high: float | None) -> str:

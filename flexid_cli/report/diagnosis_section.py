@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 from flexid_cli.report.parameter import finite, parameter_section
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
         Diagnosis,
         Evidence,
         HeldOut,
+        Locality,
         NamedEffect,
         ResidualMap,
         Shape,
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from flexid_cli.estimate.result import ModelEffect
 
 _NOT_JUDGED = "the record could not be judged"
+_NO_NUMBER = "a number is missing where this record cannot give it: a slope without a loop, a share of zero"
 _NOT_COMPUTED = "could not be computed from this record"
 
 
@@ -52,6 +55,7 @@ def diagnosis_section(diagnosis: Diagnosis) -> dict[str, Any]:
         "parameters_before": [parameter_section(one) for one in diagnosis.parameters_before],
         "parameters_after": [parameter_section(one) for one in diagnosis.parameters_after],
         "maps": [_map(one) for one in diagnosis.maps],
+        "locality": None if diagnosis.locality is None else _locality(diagnosis.locality),
         "tested": [_tested(one, _chosen(diagnosis)) for one in diagnosis.tested],
         "next_recording": diagnosis.next_recording,
         "notes": diagnosis.notes,
@@ -128,6 +132,7 @@ def _where(where: Where) -> dict[str, Any]:
         "interval": _pair(where.interval),
         "frequency_hz": _pair(where.frequency_hz),
         "shape": None if where.shape is None else _shape(where.shape),
+        "suggests": where.suggests,
     }
 
 
@@ -158,6 +163,28 @@ def _map(one: ResidualMap) -> dict[str, Any]:
         "unit": one.unit,
         "reason": _gaps(curves.values()),
     }
+
+
+def _locality(found: Locality) -> dict[str, Any]:
+    section: dict[str, Any] = _plain(found)
+    return {**section, "reason": _NO_NUMBER if _has_gaps(section) else ""}
+
+
+def _plain(value: Any) -> Any:
+    """Frozen data as mappings, lists and finite numbers, under the names of its fields."""
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    if hasattr(value, "tolist"):
+        return _numbers(value)
+    return finite(value) if isinstance(value, float) else value
+
+
+def _has_gaps(value: Any) -> bool:
+    if isinstance(value, dict):
+        return any(_has_gaps(one) for key, one in value.items() if key != "loop" or one is not None)
+    return any(_has_gaps(one) for one in value) if isinstance(value, list) else value is None
 
 
 def _numbers(values: Array) -> list[float | None]:

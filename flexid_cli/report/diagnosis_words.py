@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from flexid_cli.report import locality_words
 from flexid_cli.report.numbers import MISSING, format_significant
 
 if TYPE_CHECKING:
@@ -29,7 +30,12 @@ _SMALLEST_P_VALUE = 0.001
 def captions(diagnosis: Mapping[str, Any]) -> dict[str, str]:
     """What each figure that a diagnosis can have shows, by its key, in the order of the report."""
     maps = {map_key(k): _map_finding(one) for k, one in enumerate(diagnosis["maps"])}
-    return {RESIDUAL_FIGURE: _residual_finding(diagnosis), **maps, SHAPE_FIGURE: _shape_finding(diagnosis)}
+    return {
+        RESIDUAL_FIGURE: _residual_finding(diagnosis),
+        **maps,
+        SHAPE_FIGURE: _shape_finding(diagnosis),
+        **locality_words.captions(diagnosis),
+    }
 
 
 def map_key(index: int) -> str:
@@ -120,7 +126,12 @@ def alternatives_sentence(effect: Mapping[str, Any]) -> str:
 def left_sentence(diagnosis: Mapping[str, Any]) -> str:
     """Where what is left unexplained stands; empty where nothing is."""
     location = diagnosis["location"]
-    return "" if location is None else f"What stays unexplained shows {place(location)}."
+    if location is None:
+        return ""
+    # The sentence on top may have the first of them already.
+    further = [s for s in location["suggests"] if s[1:] not in diagnosis["sentence"]]
+    suggests = f" What that suggests: {'; '.join(further)}." if further else ""
+    return f"What stays unexplained shows {place(location)}.{suggests}"
 
 
 def simulation_sentence(diagnosis: Mapping[str, Any]) -> str:
@@ -200,9 +211,20 @@ def _residual_finding(diagnosis: Mapping[str, Any]) -> str:
 
 def _map_finding(one: Mapping[str, Any]) -> str:
     """Say what the figure of a residual map shows."""
-    return (
+    text = (
         f"Mean residual of the {one['equation']} equation over {phrase(one['variable'])}, before and after, with "
         "the 95 % band in which it does not differ from zero"
+    )
+    sizes = [max((abs(y) for y in one[kind] if y is not None), default=None) for kind in ("before", "after")]
+    if None in sizes:
+        return text
+    outside = sum(
+        abs(y) > band for y, band in zip(one["after"], one["band"], strict=True) if None not in (y, band)
+    )
+    places = "no place" if outside == 0 else f"{outside} of {len(one['x'])} places"
+    return (
+        f"{text}: at most {rounded(sizes[0])} {one['unit']} before and {rounded(sizes[1])} {one['unit']} after, which"
+        f" leaves the band at {places}"
     )
 
 

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flexid_cli.report.diagnosis_words import RESIDUAL_FIGURE, SHAPE_FIGURE, labelled, map_key, phrase
+from flexid_cli.report.drawing import BAND, MEASURED, PREDICTED, RESIDUAL, RESONANCE, UNDERNEATH, legend
+from flexid_cli.report.drawing import svg as _svg
+from flexid_cli.report.locality_words import tells
 from flexid_cli.report.numbers import format_significant
 from flexid_cli.report.words import quantity
 
@@ -18,40 +21,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from flexid_cli.diagnose.result import Diagnosis, ResidualMap, Traces, Where
+    from flexid_cli.diagnose.result import Diagnosis, Locality, ResidualMap, Traces, Where
     from flexid_cli.estimate.result import ModelResult, PipelineSummary
 
     Array = NDArray[np.float64]
 
-# Okabe and Ito's palette, which people with any of the usual colour deficiencies can tell apart.
-_MEASURED = "#444444"
-_UNDERNEATH = "#AAAAAA"
-_PREDICTED = "#D55E00"
-_RESIDUAL = "#0072B2"
-_BAND = "#56B4E9"
-_RESONANCE = "#B3007D"
 _BINS = 1500
 _GAP_PERIODS = 4.0
 _LOWEST_DB = -80.0
 _FLOOR_DB = -200.0
 _DECADES = 6.0
-_STYLE: dict[str, Any] = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
-    "font.size": 10.0,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": "#DDDDDD",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "legend.borderaxespad": 0.0,
-    "path.simplify": True,
-    "path.simplify_threshold": 0.2,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "flexid",
-}
 
 
 def model_figures(model: ModelResult) -> dict[str, str]:
@@ -73,16 +52,16 @@ def figure_torque(model: ModelResult) -> str:
         trace = model.trace
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
         # Wide and light, or a good prediction would hide it.
-        _line(upper, trace.time_s, trace.measured, color=_UNDERNEATH, linewidth=3.2, label="measured")
-        _line(upper, trace.time_s, trace.predicted, color=_PREDICTED, linewidth=0.9, label="predicted")
+        _line(upper, trace.time_s, trace.measured, color=UNDERNEATH, linewidth=3.2, label="measured")
+        _line(upper, trace.time_s, trace.predicted, color=PREDICTED, linewidth=0.9, label="predicted")
         residual = trace.measured - trace.predicted
-        _line(lower, trace.time_s, residual, color=_RESIDUAL, linewidth=0.9, label="residual")
+        _line(lower, trace.time_s, residual, color=RESIDUAL, linewidth=0.9, label="residual")
         upper.set_ylabel(f"motor {quantity(trace.unit)} ({trace.unit})")
         lower.set_ylabel(f"residual ({trace.unit})")
         lower.set_xlabel("time (s)")
-        lower.axhline(0.0, color=_MEASURED, linewidth=0.6)
+        lower.axhline(0.0, color=MEASURED, linewidth=0.6)
         upper.margins(x=0.01)
-        _legend(upper, columns=2)
+        legend(upper, columns=2)
 
     return _svg(draw, f"Measured and predicted motor {quantity(model.trace.unit)}, model {model.id}", 5.4)
 
@@ -97,11 +76,11 @@ def figure_filter(model: ModelResult) -> str:
         floor = 10.0 ** (_FLOOR_DB / 20.0)
         decibel = 20.0 * np.log10(np.clip(np.abs(magnitude), floor, None))
         axes.set_xscale("log")
-        _line(axes, frequency, decibel, logarithmic=True, color=_MEASURED, linewidth=1.6, label="filters")
+        _line(axes, frequency, decibel, logarithmic=True, color=MEASURED, linewidth=1.6, label="filters")
         axes.set_ylim(_LOWEST_DB, max(6.0, float(np.max(decibel, initial=0.0)) + 3.0))
         axes.set_ylabel("magnitude (dB)")
         _frequency_axis(axes, pipeline, frequency)
-        _legend(axes, columns=3)
+        legend(axes, columns=3)
 
     return _svg(draw, f"Magnitude of the filter chain, model {model.id}", 3.9)
 
@@ -118,30 +97,35 @@ def figure_spectrum(model: ModelResult) -> str:
         if top > 0.0:
             axes.set_yscale("log")
             density = np.clip(density, top * 10.0**-_DECADES, None)
-        _line(axes, frequency, density, color=_MEASURED, linewidth=1.2, label="measured", logarithmic=True)
+        _line(axes, frequency, density, color=MEASURED, linewidth=1.2, label="measured", logarithmic=True)
         axes.set_ylabel(f"{quantity(model.trace.unit)} density ({spectrum.unit})")
         _frequency_axis(axes, model.pipeline, frequency)
-        _legend(axes, columns=3)
+        legend(axes, columns=3)
 
     return _svg(draw, f"Amplitude spectrum of the motor {quantity(model.trace.unit)}, model {model.id}", 3.9)
 
 
 def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, str]:
     """Return every figure of a diagnosis as SVG text, by the keys of `diagnosis_words.captions`."""
+    from flexid_cli.report.locality_figures import locality_figures
+
     figures: dict[str, str] = {}
     if diagnosis.traces is not None and diagnosis.traces.before:
-        figures[RESIDUAL_FIGURE] = figure_residual(diagnosis.traces)
+        marks = diagnosis.locality if tells(diagnosis.verdict) else None
+        figures[RESIDUAL_FIGURE] = figure_residual(diagnosis.traces, marks)
     for k, one in enumerate(diagnosis.maps):
         figures[map_key(k)] = figure_map(one)
     if diagnosis.location is not None and diagnosis.location.shape is not None:
         figures[SHAPE_FIGURE] = figure_shape(diagnosis.location)
+    if diagnosis.locality is not None and tells(diagnosis.verdict):
+        figures |= locality_figures(diagnosis.locality)
     return figures
 
 
-def figure_residual(traces: Traces) -> str:
+def figure_residual(traces: Traces, found: Locality | None = None) -> str:
     """Draw the residual of each equation over time, before and after; the same scale for both.
 
-    Where nothing changed there is one line.
+    Where nothing changed there is one line. Changes and isolated events are marked.
     """
     changed = any(not np.array_equal(a, traces.after.get(e, a)) for e, a in traces.before.items())
 
@@ -150,17 +134,29 @@ def figure_residual(traces: Traces) -> str:
         for axes, (equation, before) in zip(rows, traces.before.items(), strict=True):
             if changed:
                 # Light, or what is left would hide behind what was there.
-                _line(axes, traces.time_s, before, color=_UNDERNEATH, linewidth=1.4, label="before")
+                _line(axes, traces.time_s, before, color=UNDERNEATH, linewidth=1.4, label="before")
             after = traces.after.get(equation, before)
             label = "after" if changed else "residual"
-            _line(axes, traces.time_s, after, color=_RESIDUAL, linewidth=0.9, label=label)
+            _line(axes, traces.time_s, after, color=RESIDUAL, linewidth=0.9, label=label)
             axes.set_ylabel(f"{phrase(equation)} ({traces.unit})")
             axes.margins(x=0.01)
+            _mark(axes, equation, found)
         rows[-1].set_xlabel("time (s)")
-        _legend(rows[0], columns=2)
+        legend(rows[0], columns=4)
 
     title = f"Residual of each equation{' before and after' if changed else ''}"
     return _svg(draw, title, 1.6 + 1.9 * len(traces.before))
+
+
+def _mark(axes: Axes, equation: str, found: Locality | None) -> None:
+    """Mark changes in every equation, and events in their own."""
+    for k, change in enumerate(() if found is None else found.changes):
+        label = "change" if k == 0 else None
+        axes.axvline(change.time_s, color=RESONANCE, linestyle="--", linewidth=1.2, label=label)
+    own = [] if found is None else [e for e in found.events if e.equation == equation]
+    for k, event in enumerate(own):
+        label = "event" if k == 0 else None
+        axes.axvspan(event.start_s, event.end_s, color=PREDICTED, alpha=0.25, linewidth=0.0, label=label)
 
 
 def figure_map(one: ResidualMap) -> str:
@@ -169,15 +165,15 @@ def figure_map(one: ResidualMap) -> str:
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         label = "95 % band of no difference"
-        axes.fill_between(one.x, -one.band, one.band, color=_BAND, alpha=0.3, linewidth=0.0, label=label)
-        axes.axhline(0.0, color=_MEASURED, linewidth=0.6)
+        axes.fill_between(one.x, -one.band, one.band, color=BAND, alpha=0.3, linewidth=0.0, label=label)
+        axes.axhline(0.0, color=MEASURED, linewidth=0.6)
         axes.plot(
-            one.x, one.before, color=_PREDICTED, marker="o", markersize=3.5, linewidth=1.2, label="before"
+            one.x, one.before, color=PREDICTED, marker="o", markersize=3.5, linewidth=1.2, label="before"
         )
-        axes.plot(one.x, one.after, color=_RESIDUAL, marker="s", markersize=3.5, linewidth=1.2, label="after")
+        axes.plot(one.x, one.after, color=RESIDUAL, marker="s", markersize=3.5, linewidth=1.2, label="after")
         axes.set_xlabel(labelled(phrase(one.variable), one.x_unit))
         axes.set_ylabel(f"mean residual ({one.unit})")
-        _legend(axes, columns=3)
+        legend(axes, columns=3)
 
     title = f"Residual of the {phrase(one.equation)} equation over {phrase(one.variable)}"
     return _svg(draw, title, 3.9)
@@ -192,32 +188,15 @@ def figure_shape(where: Where) -> str:
         if shape is None:
             return
         axes.fill_between(
-            shape.x, shape.low, shape.high, color=_BAND, alpha=0.3, linewidth=0.0, label="95 % band"
+            shape.x, shape.low, shape.high, color=BAND, alpha=0.3, linewidth=0.0, label="95 % band"
         )
-        axes.axhline(0.0, color=_MEASURED, linewidth=0.6)
-        axes.plot(shape.x, shape.y, color=_PREDICTED, marker="o", markersize=3.5, linewidth=1.2, label="mean")
+        axes.axhline(0.0, color=MEASURED, linewidth=0.6)
+        axes.plot(shape.x, shape.y, color=PREDICTED, marker="o", markersize=3.5, linewidth=1.2, label="mean")
         axes.set_xlabel(labelled(phrase(where.variable), shape.x_unit))
         axes.set_ylabel(f"unexplained ({shape.unit})")
-        _legend(axes, columns=2)
+        legend(axes, columns=2)
 
     return _svg(draw, f"What stays unexplained, {phrase(where.equation)} equation", 3.9)
-
-
-def _svg(draw: Any, title: str, height_in: float) -> str:
-    """Run ``draw`` on a new figure in the project's style, whatever the user's matplotlibrc says."""
-    import io
-
-    from matplotlib import style
-    from matplotlib.figure import Figure
-
-    with style.context(["default", _STYLE]):
-        figure = Figure(figsize=(9.375, height_in), layout="constrained", facecolor="white")
-        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
-        draw(figure)
-        buffer = io.StringIO()
-        metadata = {"Date": None, "Creator": "flexid", "Title": title}
-        figure.savefig(buffer, format="svg", metadata=metadata, facecolor="white")
-    return buffer.getvalue()
 
 
 def _line(axes: Axes, x: Array, y: Array, *, logarithmic: bool = False, **appearance: Any) -> None:
@@ -286,15 +265,9 @@ def _frequency_axis(axes: Axes, pipeline: PipelineSummary, frequency: Array) -> 
     low = max(low, float(frequency[0]))
     if np.isfinite(high) and high > low:
         label = f"band used, up to {format_significant(high, 3)} Hz"
-        axes.axvspan(low, high, color=_BAND, alpha=0.3, linewidth=0.0, label=label)
+        axes.axvspan(low, high, color=BAND, alpha=0.3, linewidth=0.0, label=label)
     f1 = pipeline.f1_hz
     if f1 is not None and np.isfinite(f1) and f1 > 0.0:
         label = f"first resonance f1, {format_significant(f1, 3)} Hz"
-        axes.axvline(f1, color=_RESONANCE, linestyle="--", linewidth=1.2, label=label)
+        axes.axvline(f1, color=RESONANCE, linestyle="--", linewidth=1.2, label=label)
     axes.set_xlim(float(frequency[0]), float(frequency[-1]) if frequency[-1] > frequency[0] else None)
-
-
-def _legend(axes: Axes, *, columns: int) -> None:
-    """Put the legend above the axes, where it covers no data."""
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.01), ncols=columns)

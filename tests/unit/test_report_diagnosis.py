@@ -87,7 +87,7 @@ def test_the_section_is_the_one_of_the_design():
     found = section(EXAMPLES.pair())
     assert list(found) == [
         "verdict", "sentence", "model", "effects", "location", "fit", "parameters_before", "parameters_after",
-        "maps", "tested", "next_recording", "notes",
+        "maps", "locality", "tested", "next_recording", "notes",
     ]  # fmt: skip
     effect = found["effects"][0]
     assert (effect["name"], effect["code"], effect["family"]) == ("backlash", "FX202", "transmission")
@@ -140,12 +140,28 @@ def test_no_number_of_the_engine_breaks_the_document(numbers, other):
         simulation=SimulationError(abs(numbers[0]), abs(other), "torque", "N.m"),
         maps=(replace(EXAMPLES.residual_map(), band=np.full(25, abs(other))),),
         tested=(replace(EXAMPLES.TESTED[1], statistic=other),),
+        locality=broken_locality(numbers, other),
     )
     document = EXAMPLES.document(diagnosis)
     VALIDATOR.validate(document)
     assert strict_json(render_json(document)) == document
     for text in (render_markdown(document, {}), render_console(document)):
         assert not re.search(r"\b(nan|inf|None)\b", text)
+
+
+def broken_locality(numbers, other):
+    """Every kind of entry with numbers of any kind."""
+    one = EXAMPLES.locality()
+    line = replace(one.angle[0].lines[0], amplitude=numbers[0], false_alarm=other)
+    return replace(
+        one,
+        changes=(replace(one.changes[0], time_s=numbers[1], size=other, share=numbers[2]),),
+        events=(replace(one.events[0], start_s=other, times_usual=numbers[3]),),
+        reversals=(replace(one.reversals[1], energy_share=numbers[4], mean=np.full(21, other)),),
+        angle=(replace(one.angle[0], lines=(line,)),),
+        loop=replace(one.loop, slope=numbers[5], share=other, width=np.full(4, numbers[0])),
+        drift=(replace(one.drift[0], per_minute=other, share=numbers[2]),),
+    )
 
 
 def test_inputs_have_their_roles_and_their_own_totals():
@@ -280,9 +296,41 @@ def test_no_html_and_every_figure_is_described():
     images = {t.attrs["src"]: t.content for t in tokens if t.type == "image"}
     assert list(images) == [
         "run_diagnosis_residual.svg", "run_diagnosis_map_1.svg", "run_diagnosis_map_2.svg",
-        "run_diagnosis_shape.svg",
+        "run_diagnosis_shape.svg", "run_diagnosis_reversals.svg", "run_diagnosis_angle.svg", "run_diagnosis_loop.svg",
     ]  # fmt: skip
     assert all(len(caption) > 30 for caption in images.values())
+
+
+def test_where_and_when_is_told_of_a_mismatch_only():
+    for name in ("unexplained", "pair"):
+        flat = " ".join(markdown(name).replace("\\", "").split())
+        assert "From 17.31 s on JL differs by +4.12 kg.m2" in flat
+        assert "71 % of the load residual's energy" in flat
+        assert "lines of 2, 0.46 cycles per motor revolution" in flat
+        assert "to the power of 0.02" in flat
+        assert "FVm by -3.1 N.m.s/rad a minute" in flat
+        assert "23 % of the motor" not in flat  # not sure
+    assert "Residual that the named effects leave" in markdown("pair")
+    assert "17.31" not in render_console(EXAMPLES.case("adequate")[1])
+    assert section(EXAMPLES.adequate())["locality"]["changes"][0]["column"] == "JL"
+
+
+def test_the_sentence_on_top_is_not_said_again():
+    found = EXAMPLES.unexplained()
+    first, second = found.location.suggests
+    said = replace(found, sentence=f"It is unknown. {first[0].upper()}{first[1:]}.")
+    text = " ".join(render_console(EXAMPLES.document(said)).split())
+    assert text.count(first[1:]) == 1
+    assert second in text
+
+
+def test_a_number_of_the_place_that_is_none_has_a_reason():
+    one = EXAMPLES.locality()
+    found = section(replace(EXAMPLES.explained(), locality=replace(one, drift=one.drift[:1])))["locality"]
+    assert found["reason"] == ""
+    assert section(replace(EXAMPLES.explained(), locality=one))["locality"]["reason"]
+    nothing = section(replace(EXAMPLES.explained(), locality=replace(one, loop=None, drift=())))["locality"]
+    assert (nothing["loop"], nothing["reason"]) == (None, "")
 
 
 # --- figures ---
