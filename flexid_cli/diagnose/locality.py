@@ -19,7 +19,7 @@ from flexid_cli.diagnose.loop_width import loop_width
 from flexid_cli.diagnose.physical import torque_scale
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.result import AngleSpectrum, Event, Locality, Reversals
-from flexid_cli.diagnose.reversals import reversals, turns
+from flexid_cli.diagnose.reversal_windows import reversals, turns
 from flexid_cli.effects.motion import Motion, Terms
 from flexid_cli.estimate.result import Estimate
 from flexid_cli.signals.recording import Recording
