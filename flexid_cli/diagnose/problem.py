@@ -26,12 +26,16 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Part = Callable[["Stretch", Motion], Sequence["Complex | None"]]
+Sharpener = Callable[[Segment, float], tuple[Array, Array]]
+Effects = Sequence[tuple[Callable[[Motion], Terms], Array]]  # columns of effects and their amplitudes
 
 HALF_WIDTH = 12  # of the derivatives: exact to 1e-6 up to a third of the sampling rate
 MARGIN = 4 * HALF_WIDTH  # samples at the ends that derivatives of derivatives cannot reach
 # Bands over that of the rows: of the motion that columns are made of, and of the velocities whose sign is taken. A
 # reversal is sharper than any band; the joint's encoder sees more noise and a load that reverses more softly.
 SMOOTH_BAND, MOTOR_SIGN_BAND, JOINT_SIGN_BAND = 1.5, 4.0, 2.0
+FINE = 4  # steps a sampling period, of the velocities whose sign is taken
+LEAST_CHANGE = 1e-4  # of a velocity over its reversal width, for which a mean is told from its ends
 HIGHEST_CUTOFF = 0.44  # of the sampling rate; above it nothing is cut
 SHORTEST_S = 2.0
 # Torque that no model of a drive predicts, as a share of the torque's RMS: timing, rounding, the finite filters.
@@ -55,6 +59,8 @@ class Stretch:
     segment : Segment
     rate_hz, band_hz : float
         Sampling rate, and band of the rows.
+    sharpener : callable, optional
+        (segment, rate) -> the velocities whose sign is taken, in place of low-passed ones.
 
     Attributes
     ----------
@@ -66,7 +72,14 @@ class Stretch:
         Velocities whose sign is taken.
     """
 
-    def __init__(self, segment: Segment, rate_hz: float, band_hz: float) -> None:
+    def __init__(
+        self,
+        segment: Segment,
+        rate_hz: float,
+        band_hz: float,
+        sharpener: Sharpener | None = None,
+    ) -> None:
+        self._sharpener = sharpener
         self.rate_hz, self.period_s, self._band = rate_hz, 1.0 / rate_hz, band_hz
         self.torque, self.motor = segment.torque, segment.motor_position
         self.joint = np.empty(0) if segment.joint_position is None else segment.joint_position
@@ -76,14 +89,32 @@ class Stretch:
         self.taper = Taper.of(segment.samples, rate_hz, band_hz, MARGIN)
         self.motor_smooth = self.lowpass(self.motor, SMOOTH_BAND)
         self.motor_velocity = self.derivative(self.motor_smooth, 1)
-        self.motor_sharp = self.derivative(self.lowpass(self.motor, MOTOR_SIGN_BAND), 1)
         if self.joint.size:
             self.joint_smooth = self.lowpass(self.joint, SMOOTH_BAND)
+        if sharpener is not None:
+            fine = sharpener(segment, rate_hz)
+            (self.motor_sharp, self.joint_sharp), (self.motor_fine, self.joint_fine) = (
+                [v[::FINE] for v in fine],
+                fine,
+            )
+            return
+        self.motor_sharp = self.derivative(self.lowpass(self.motor, MOTOR_SIGN_BAND), 1)
+        self.motor_fine = between(self.motor_sharp)
+        if self.joint.size:
             self.joint_sharp = self.derivative(self.lowpass(self.joint, JOINT_SIGN_BAND), 1)
+            self.joint_fine = between(self.joint_sharp)
+
+    def like(self, segment: Segment) -> Stretch:
+        """The same stretch with other signals."""
+        return Stretch(segment, self.rate_hz, self._band, self._sharpener)
 
     def with_joint(self, joint: Array) -> Stretch:
         """The same stretch with another joint position."""
-        return Stretch(replace(self.segment, joint_position=joint), self.rate_hz, self._band)
+        return self.like(replace(self.segment, joint_position=joint))
+
+    def sharpened(self, sharpener: Sharpener) -> Stretch:
+        """The same stretch with another way to tell the velocities where they reverse."""
+        return Stretch(self.segment, self.rate_hz, self._band, sharpener)
 
     def lowpass(self, x: Array, over_band: float) -> Array:
         """Zero-phase low pass at a multiple of the rows' band."""
@@ -189,6 +220,7 @@ class Problem:
         self,
         base: Base,
         *,
+        stretches: Sequence[Stretch] | None = None,
         shift: float | None = None,
         applied: Mapping[Form, Array] | None = None,
         stiffening: float | None = None,
@@ -196,9 +228,10 @@ class Problem:
         trust: Sequence[Array] | None = None,
     ) -> Problem:
         """The same record linearised elsewhere, with other errors of the joint's position taken out."""
-        stretches = self.stretches
+        recorded = self.recorded if stretches is None else stretches
+        stretches = self.stretches if stretches is None else stretches
         if applied is not None and (applied or self.applied):
-            stretches = [_without_errors(s, applied) for s in self.recorded]
+            stretches = [_without_errors(s, applied) for s in recorded]
         other = Problem(
             stretches,
             base,
@@ -217,7 +250,7 @@ class Problem:
             led=self.led if led is None else led,
             trust=self.trust if trust is None else trust,
         )
-        other.recorded = self.recorded
+        other.recorded = recorded
         return other
 
     @property
@@ -258,7 +291,7 @@ class Problem:
     def spectral(self, stretch: Stretch) -> Complex:
         """Spectral matrix of the equations' noise and of what no model predicts, shape (frequencies, m, m)."""
         omega = 2.0 * np.pi * stretch.taper.frequency_hz
-        floor = (MODEL_FLOOR * self.torque_rms) ** 2 * 0.5 * stretch.rate_hz / self.band_hz
+        floor = self.floor(stretch.rate_hz)
         if self.both:
             return two_encoder_noise(self.base, self.noise, omega) + floor * np.eye(2)
         # What the model lacks at the motor passes 1 + X2 s + X1 s^2 as the torque itself does.
@@ -267,18 +300,24 @@ class Problem:
             motor_only_noise(self.base, self.noise, omega) + floor * (1.0 + passed)[:, None, None]
         )
 
+    def floor(self, rate_hz: float) -> float:
+        """Variance a sample of white noise that stands for what no model predicts."""
+        return (MODEL_FLOOR * self.torque_rms) ** 2 * 0.5 * rate_hz / self.band_hz
+
     def motion(self, s: Stretch) -> Motion:
         """Motion of a stretch at the linearisation."""
         base = self.base
-        motor_sign = reversal(s.motor_sharp, base.motor_reversal)
         if self.both:
-            joint, sharp = s.joint_smooth, s.joint_sharp
+            joint = s.joint_smooth
+            motor_sign = mean_sign(s.motor_fine, base.motor_reversal)
+            joint_sign = mean_sign(s.joint_fine, base.load_reversal)
         else:
+            motor_sign = reversal(s.motor_sharp, base.motor_reversal)
             friction = base.FVm * s.motor_velocity + base.FSm * s.lowpass(motor_sign, SMOOTH_BAND)
             inertial = base.Jm * s.derivative(s.motor_smooth, 2)
             joint = s.motor_smooth - (s.lowpass(s.torque, SMOOTH_BAND) - inertial - friction) / base.K
             joint = s.lowpass(joint, SMOOTH_BAND)
-            sharp = s.derivative(self._led(s) if self.led else joint, 1)
+            joint_sign = reversal(s.derivative(self._led(s) if self.led else joint, 1), base.load_reversal)
         velocity = s.derivative(joint, 1)
         return Motion(
             time_s=s.time_s,
@@ -289,7 +328,7 @@ class Problem:
             joint_velocity=velocity,
             joint_acceleration=s.derivative(joint, 2),
             motor_sign=motor_sign,
-            joint_sign=reversal(sharp, base.load_reversal),
+            joint_sign=joint_sign,
             deflection=s.motor_smooth - joint - base.torsion_zero,
             deflection_rate=s.motor_velocity - velocity,
             period_s=s.period_s,
@@ -400,11 +439,13 @@ class Problem:
         """Rows of one Coulomb column for another reversal width, shape (r,)."""
 
         def part(s: Stretch, m: Motion) -> list[Complex | None]:
-            if field == "motor_reversal":
-                sign = reversal(s.motor_sharp, width)
-                return self._one(s.spectrum(sign if self.both else self.through(s, sign)), "motor")
-            sharp = s.joint_sharp if self.both else m.joint_velocity
-            return self._one(s.spectrum(reversal(sharp, width)), "load")
+            motor = field == "motor_reversal"
+            if self.both:
+                sign = mean_sign(s.motor_fine if motor else s.joint_fine, width)
+                return self._one(s.spectrum(sign), "motor" if motor else "load")
+            if motor:
+                return [s.spectrum(self.through(s, reversal(s.motor_sharp, width)))]
+            return [s.spectrum(reversal(m.joint_velocity, width))]
 
         return self._rows(part)[:, 0]
 
@@ -438,7 +479,7 @@ class Problem:
 
         def part(s: Stretch, m: Motion) -> list[Complex | None]:
             seen.append(terms_of(m))
-            return (self._place_both if self.both else self._place_alone)(s, seen[-1])
+            return self.place(s, seen[-1])
 
         rows = self._rows(part)
         if not self.both or seen[0].transmission is None:
@@ -487,6 +528,10 @@ class Problem:
     def _torsion(self) -> Array:
         """Rows of a spring of unit stiffness, shape (r,)."""
         return self._rows(lambda s, m: self._place_both(s, Terms(transmission=m.deflection[:, None])))[:, 0]
+
+    def place(self, s: Stretch, t: Terms) -> list[Complex | None]:
+        """Spectra of what an effect adds to each equation."""
+        return (self._place_both if self.both else self._place_alone)(s, t)
 
     def _place_both(self, s: Stretch, t: Terms) -> list[Complex | None]:
         b = self.base
@@ -600,6 +645,47 @@ class Problem:
             strong = {n: float(np.clip(x, held[n] / ASTRAY, held[n] * ASTRAY)) for n, x in strong.items()}
         friction = {n: getattr(b, n) + v[n] for n in ("FVm", "FSm", "FV", "FS") if n in v}
         return replace(b, **friction, **strong)
+
+
+def between(velocity: Array) -> Array:
+    """A velocity at `FINE` steps a period, straight between its samples."""
+    at = np.arange(FINE * (velocity.size - 1) + 1) / FINE
+    return np.interp(at, np.arange(velocity.size), velocity)
+
+
+def mean_sign(fine: Array, width: float) -> Array:
+    """Mean of tanh(v / width) over the period about each sample, freed of the mean's damping, shape (n,).
+
+    Samples of a sign that turns within a period hold its time no better than to the period. A mean over T damps by
+    sinc(f T), that is by (w T)^2 / 24.
+
+    Parameters
+    ----------
+    fine : ndarray, shape (FINE (n - 1) + 1,)
+        The velocity, `FINE` steps a period.
+    width : float
+    """
+    parts = _straight(fine[:-1], fine[1:], width)
+    half = FINE // 2
+    padded = np.concatenate([np.repeat(parts[:1], half), parts, np.repeat(parts[-1:], half)])
+    mean = padded.reshape(-1, FINE).mean(axis=1)
+    out = mean.copy()
+    out[1:-1] -= np.diff(mean, 2) / 24.0
+    return out
+
+
+def _straight(a: Array, b: Array, width: float) -> Array:
+    """Mean of tanh(v / width) for v from a to b: the difference of its integral, width ln cosh(v / width)."""
+    x, y = a / width, b / width
+    change = y - x
+    near = np.abs(change) < LEAST_CHANGE
+    mean = (_log_cosh(y) - _log_cosh(x)) / np.where(near, 1.0, change)
+    return np.where(near, np.tanh(0.5 * (x + y)), mean)
+
+
+def _log_cosh(x: Array) -> Array:
+    size = np.abs(x)
+    return np.asarray(size + np.log1p(np.exp(-2.0 * size)))
 
 
 def _reversal_step(velocities: Sequence[Array], rate_hz: float, cutoff_hz: float) -> float:

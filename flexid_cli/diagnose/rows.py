@@ -89,6 +89,11 @@ class Weights:
 
     def apply(self, columns: Sequence[Complex | None]) -> Array:
         """Rows of one or more columns, shape (equations, rows, k); None stands for zeros."""
+        out = self.plain(columns)
+        return out if self.trust is None else out * self.trust[:, :, None]
+
+    def plain(self, columns: Sequence[Complex | None]) -> Array:
+        """The rows without their trust."""
         from scipy.fft import irfft
 
         k = next(c.shape[1] for c in columns if c is not None)
@@ -103,7 +108,7 @@ class Weights:
                 mixed = part if mixed is None else mixed + part
             if mixed is not None:
                 out[i] = (scale * irfft(mixed, self.rows, axis=0))[self.open]
-        return out if self.trust is None else out * self.trust[:, :, None]
+        return out
 
     def back(self, rows: Array) -> Array:
         """Transpose of `apply` over the taper: what rows weigh each sample with, shape (equations, n).
