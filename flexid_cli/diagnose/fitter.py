@@ -20,6 +20,7 @@ from flexid_cli.effects.motion import Base, Motion, Terms
 Array = NDArray[np.float64]
 
 SETTLED = 1e-3  # change of the cost's logarithm
+SETTLED_STIFFNESS, SETTLING_STEPS = 1e-4, 6  # relative change of the stiffness
 WIDTH_STEPS = 6
 WIDTH_RANGE = 1.2  # of the logarithm of a reversal width, around the present one
 REVERSALS = {"motor_reversal": "FSm", "load_reversal": "FS"}  # widths of the base and their friction
@@ -183,7 +184,20 @@ class Fitter:
         """The same model with reversals and weights of rows that know of its effects (both encoders)."""
         if not fitted.problem.both:
             return fitted
-        return self.relax(informed(fitted.problem, fitted), fitted.chosen, rounds=1)
+        return self.settled(self.relax(informed(fitted.problem, fitted), fitted.chosen, rounds=1))
+
+    def settled(self, fitted: Fitted) -> Fitted:
+        """The same model linearised where its own fit is, for an effect has one amplitude in both equations only there.
+
+        Elsewhere the cost may be lower, and the stiffness is another one.
+        """
+        for _ in range(SETTLING_STEPS):
+            base = self.moved(fitted)
+            if abs(base.K / fitted.problem.base.K - 1.0) < SETTLED_STIFFNESS:
+                break
+            problem = fitted.problem.at(base, applied=self._errors(fitted), stiffening=fitted.stiffening)
+            fitted = self.fit(problem, fitted.chosen)
+        return fitted
 
     def _reversing(self, fitted: Fitted) -> Fitted:
         """Without a joint encoder, the likelier of the two ways to tell when the load reverses."""

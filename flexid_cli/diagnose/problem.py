@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from flexid_cli.diagnose.mean_sign import FINE, between, mean_sign
 from flexid_cli.diagnose.rows import Complex, Taper, Weights, motor_only_noise, two_encoder_noise
 from flexid_cli.effects.motion import Base, Motion, Terms
 from flexid_cli.effects.signature import Scale
@@ -34,8 +35,6 @@ MARGIN = 4 * HALF_WIDTH  # samples at the ends that derivatives of derivatives c
 # Bands over that of the rows: of the motion that columns are made of, and of the velocities whose sign is taken. A
 # reversal is sharper than any band; the joint's encoder sees more noise and a load that reverses more softly.
 SMOOTH_BAND, MOTOR_SIGN_BAND, JOINT_SIGN_BAND = 1.5, 4.0, 2.0
-FINE = 4  # steps a sampling period, of the velocities whose sign is taken
-LEAST_CHANGE = 1e-4  # of a velocity over its reversal width, for which a mean is told from its ends
 HIGHEST_CUTOFF = 0.44  # of the sampling rate; above it nothing is cut
 SHORTEST_S = 2.0
 # Torque that no model of a drive predicts, as a share of the torque's RMS: timing, rounding, the finite filters.
@@ -79,7 +78,7 @@ class Stretch:
         band_hz: float,
         sharpener: Sharpener | None = None,
     ) -> None:
-        self._sharpener = sharpener
+        self.sharpener = sharpener
         self.rate_hz, self.period_s, self._band = rate_hz, 1.0 / rate_hz, band_hz
         self.torque, self.motor = segment.torque, segment.motor_position
         self.joint = np.empty(0) if segment.joint_position is None else segment.joint_position
@@ -106,7 +105,7 @@ class Stretch:
 
     def like(self, segment: Segment) -> Stretch:
         """The same stretch with other signals."""
-        return Stretch(segment, self.rate_hz, self._band, self._sharpener)
+        return Stretch(segment, self.rate_hz, self._band, self.sharpener)
 
     def with_joint(self, joint: Array) -> Stretch:
         """The same stretch with another joint position."""
@@ -323,7 +322,7 @@ class Problem:
             time_s=s.time_s,
             torque=s.torque,
             motor_position=s.motor_smooth,
-            motor_velocity=s.motor_velocity,
+            motor_velocity=s.motor_velocity if s.sharpener is None else s.motor_sharp,
             joint_position=joint,
             joint_velocity=velocity,
             joint_acceleration=s.derivative(joint, 2),
@@ -645,47 +644,6 @@ class Problem:
             strong = {n: float(np.clip(x, held[n] / ASTRAY, held[n] * ASTRAY)) for n, x in strong.items()}
         friction = {n: getattr(b, n) + v[n] for n in ("FVm", "FSm", "FV", "FS") if n in v}
         return replace(b, **friction, **strong)
-
-
-def between(velocity: Array) -> Array:
-    """A velocity at `FINE` steps a period, straight between its samples."""
-    at = np.arange(FINE * (velocity.size - 1) + 1) / FINE
-    return np.interp(at, np.arange(velocity.size), velocity)
-
-
-def mean_sign(fine: Array, width: float) -> Array:
-    """Mean of tanh(v / width) over the period about each sample, freed of the mean's damping, shape (n,).
-
-    Samples of a sign that turns within a period hold its time no better than to the period. A mean over T damps by
-    sinc(f T), that is by (w T)^2 / 24.
-
-    Parameters
-    ----------
-    fine : ndarray, shape (FINE (n - 1) + 1,)
-        The velocity, `FINE` steps a period.
-    width : float
-    """
-    parts = _straight(fine[:-1], fine[1:], width)
-    half = FINE // 2
-    padded = np.concatenate([np.repeat(parts[:1], half), parts, np.repeat(parts[-1:], half)])
-    mean = padded.reshape(-1, FINE).mean(axis=1)
-    out = mean.copy()
-    out[1:-1] -= np.diff(mean, 2) / 24.0
-    return out
-
-
-def _straight(a: Array, b: Array, width: float) -> Array:
-    """Mean of tanh(v / width) for v from a to b: the difference of its integral, width ln cosh(v / width)."""
-    x, y = a / width, b / width
-    change = y - x
-    near = np.abs(change) < LEAST_CHANGE
-    mean = (_log_cosh(y) - _log_cosh(x)) / np.where(near, 1.0, change)
-    return np.where(near, np.tanh(0.5 * (x + y)), mean)
-
-
-def _log_cosh(x: Array) -> Array:
-    size = np.abs(x)
-    return np.asarray(size + np.log1p(np.exp(-2.0 * size)))
 
 
 def _reversal_step(velocities: Sequence[Array], rate_hz: float, cutoff_hz: float) -> float:

@@ -16,7 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from flexid_cli.diagnose.problem import FINE, Effects, Problem, Stretch, between
+from flexid_cli.diagnose.mean_sign import FINE, FULL, between
+from flexid_cli.diagnose.problem import Effects, Problem, Stretch
 from flexid_cli.effects.motion import Motion
 from flexid_cli.estimate.driven import friction_sign
 from flexid_cli.signals.recording import Segment
@@ -150,7 +151,7 @@ def _held(m: Motion, effects: Effects) -> tuple[Array, Array]:
     return motor, load
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _smoothed(position, force, axis, encoder, torque):  # type: ignore[no-untyped-def] # pragma: no cover
     """Loss of the encoder's values and the smoothed velocity; steps by the trapezoidal rule, friction implicit."""
     D, K, F, w, T = axis[1:]
@@ -162,10 +163,14 @@ def _smoothed(position, force, axis, encoder, torque):  # type: ignore[no-untype
     loss = 0.0
     for i in range(1, n):
         q, v = x[i - 1]
-        s = np.tanh(v / w)
+        s = np.tanh(v / w) if abs(v) < FULL * w else np.sign(v)
         a = 1.0 + h * (D + 0.5 * K * T)
         free = v + h * (force[i - 1] + force[i] - 2.0 * K * q - (0.5 * K * T + D) * v - F * s)
-        sign = friction_sign(free / a, v, h * F / a, w)
+        middle, reach = free / a, h * F / a
+        if abs(middle) > reach + FULL * w:  # far from a reversal
+            sign = 1.0 if middle > 0.0 else -1.0
+        else:
+            sign = friction_sign(middle, v, reach, w)
         later = (free - h * F * sign) / a
         b = a + h * F * (1.0 - sign * sign) / w
         vq = -2.0 * h * K / b

@@ -8,19 +8,19 @@ more of the encoders' noise the more it is twisted, and a damper passes its rate
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.problem import Effects, Problem, Stretch
-from flexid_cli.effects.motion import Motion, Terms
+from flexid_cli.effects.motion import Motion
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 REPLICAS, SEED = 4, 20010526
+REPLICAS_BOTH = 2  # both encoders: little is left that turns a sign
 WINDOW_S = 0.2  # over which the noise's power is averaged
 # Counts show in the steps from sample to sample: nearly all are a whole number of the smallest.
 MOST_COUNTS, LEAST_STEPS, WHOLE, MOSTLY = 100.0, 100, 0.02, 0.98
@@ -31,7 +31,7 @@ def trusted(problem: Problem, effects: Effects = ()) -> Problem:
     """The problem with every row weighted by what noise adds to it through signs and ``effects``."""
     rng = np.random.default_rng(SEED)
     width = max(1, round(2.0 * problem.band_hz * WINDOW_S))
-    added = [_added_noise(problem, effects, rng) for _ in range(REPLICAS)]
+    added = [_added_noise(problem, effects, rng) for _ in range(REPLICAS_BOTH if problem.both else REPLICAS)]
     power = [np.mean(p, axis=0) for p in zip(*added, strict=True)]
     trust = [1.0 / np.sqrt(1.0 + np.maximum(_smoothed(p, width), 0.0)) for p in power]
     return problem.at(problem.base, trust=trust)
@@ -46,8 +46,8 @@ def _added_noise(problem: Problem, effects: Effects, rng: np.random.Generator) -
         power = w.plain(_sign_noise(problem, s, m, moved))[:, :, 0] ** 2
         if effects:
             known = w.plain(_known_noise(problem, s, noisy))[:, :, 0]
-            through = [_change(columns, amplitudes, m, moved) for columns, amplitudes in effects]
-            changed = sum((w.plain(problem.place(s, t))[:, :, 0] for t in through), known)
+            through = [(columns(moved).since(columns(m)), amplitudes) for columns, amplitudes in effects]
+            changed = sum((w.plain(problem.place(s, t)) @ amplitudes for t, amplitudes in through), known)
             power += changed**2 - known**2
         out.append(power)
     return out
@@ -72,13 +72,6 @@ def _known_noise(problem: Problem, s: Stretch, noisy: Stretch) -> list[Complex |
     spring = b.K * (e - joint)
     load = b.JL * s.derivative(joint, 2) + b.FV * s.derivative(joint, 1)
     return [s.spectrum(motor + spring), s.spectrum(load - spring)]
-
-
-def _change(columns: Callable[[Motion], Terms], amplitudes: Array, m: Motion, moved: Motion) -> Terms:
-    """What an effect adds with noise in the motion beyond what it adds without."""
-    before, after = columns(m), columns(moved)
-    pairs = {f.name: (getattr(before, f.name), getattr(after, f.name)) for f in fields(Terms)}
-    return Terms(**{n: ((b - a) @ amplitudes)[:, None] for n, (a, b) in pairs.items() if a is not None})
 
 
 def _with_noise(s: Stretch, problem: Problem, rng: np.random.Generator) -> Stretch:

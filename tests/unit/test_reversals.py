@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexid_cli.diagnose.problem import FINE, between, mean_sign
+from flexid_cli.diagnose.mean_sign import FINE, between, mean_sign
 from flexid_cli.diagnose.reversals import Side
 
 RATE, SAMPLES, STEPS = 500.0, 5_000, 40
