@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import solve
-from flexid_cli.diagnose.fitter import Fitted, Fitter, without
+from flexid_cli.diagnose.fitter import Fitted, Fitter, informed, without
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.search import Search
 
@@ -81,6 +81,8 @@ def predicted(problem: Problem, fitter: Fitter, fitted: Fitted) -> Array:
     other = problem.at(
         here.base, shift=here.shift, applied=here.applied, stiffening=here.stiffening, led=here.led
     )
+    if fitted.chosen and other.both:
+        other = informed(other, fitted)
     held = {c.form: fitted.slopes(k) for k, c in enumerate(fitted.chosen)}
     there = fitter.fit(other, fitted.chosen, Search(other, fitter.forms, held))
     return np.asarray(there.y - there.basis.columns @ fitted.basis.coefficients)

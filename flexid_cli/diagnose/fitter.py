@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import Basis, solve
-from flexid_cli.diagnose.problem import Problem
+from flexid_cli.diagnose.problem import Effects, Problem
+from flexid_cli.diagnose.reversals import sharpened
 from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
-from flexid_cli.effects.motion import Base
+from flexid_cli.diagnose.trust import trusted
+from flexid_cli.effects.motion import Base, Motion, Terms
 from flexid_cli.threads import side_by_side
 
 Array = NDArray[np.float64]
@@ -23,6 +25,9 @@ WIDTH_RANGE, WIDTH_STEP, WIDTH_NEAR, MOST_WIDTHS = 1.2, 0.4, 0.02, 6
 REVERSALS = {"motor_reversal": "FSm", "load_reversal": "FS"}  # widths of the base and their friction
 REVERSAL = 3.0  # widths about zero velocity that a reversal takes
 NARROWEST = 1e-5  # reversal width, rad/s or m/s
+SETTLED_STIFFNESS, SETTLING_STEPS = 1e-4, 6  # relative change of the stiffness
+# Gain of an effect whose richer form is tried, and what that needs beyond it.
+PROMISING, EXTENDED = 0.05, 0.02
 
 
 @dataclass(frozen=True)
@@ -182,6 +187,25 @@ class Fitter:
         """Other sets of effects in the place of a fit's, each relaxed from where that is linearised."""
         return side_by_side(lambda m: self.relax(fitted.problem, m, rounds, fitted.search), models)
 
+    def reweighted(self, fitted: Fitted) -> Fitted:
+        """The same model with reversals and weights of rows that know of its effects (both encoders)."""
+        if not fitted.problem.both:
+            return fitted
+        return self.settled(self.relax(informed(fitted.problem, fitted), fitted.chosen, rounds=1))
+
+    def settled(self, fitted: Fitted) -> Fitted:
+        """The same model linearised where its own fit is.
+
+        Only there an effect has one amplitude in both equations; elsewhere the cost may be lower, with another stiffness.
+        """
+        for _ in range(SETTLING_STEPS):
+            base = self.moved(fitted)
+            if abs(base.K / fitted.problem.base.K - 1.0) < SETTLED_STIFFNESS:
+                break
+            problem = fitted.problem.at(base, applied=self._errors(fitted), stiffening=fitted.stiffening)
+            fitted = self.fit(problem, fitted.chosen)
+        return fitted
+
     def _reversing(self, fitted: Fitted) -> Fitted:
         """Without a joint encoder, the likelier of the two ways to tell when the load reverses."""
         problem = fitted.problem
@@ -259,14 +283,56 @@ class Fitter:
             else self.fit(fitted.problem, without(fitted.chosen, instead_of), fitted.search)
         )
         taken = {c.name for c in now.chosen}
-        forms = [f for f in self.forms if f.name not in taken]
+        forms = [f for f in self.forms if f.name not in taken and not f.signature.extends]
         best = side_by_side(lambda f: fitted.search.best(f, now.basis), forms)
         found = [c for c in best if c is not None]
         by_name: dict[str, Candidate] = {}
         for c in found:
             if c.form.name not in by_name or c.rank < by_name[c.form.name].rank:
                 by_name[c.form.name] = c
+        for f in self.forms:
+            if f.signature.extends and f.name in by_name:
+                by_name[f.name] = _extended(fitted.search, f, by_name[f.name], now.basis)
         return sorted(by_name.values(), key=lambda c: c.rank)
+
+
+def _extended(search: Search, form: Form, plain: Candidate, now: Basis) -> Candidate:
+    """The richer form of an effect where it explains clearly more than the plain one."""
+    if plain.refused or plain.gain < PROMISING:
+        return plain
+    richer = search.extended(form, plain, now)
+    return richer if not richer.refused and richer.gain - plain.gain > EXTENDED else plain
+
+
+def informed(problem: Problem, fitted: Fitted) -> Problem:
+    """A record with reversals and weights of rows that know of a model.
+
+    With the motor's encoder alone, of its friction only: the joint's motion is rebuilt, its reversals are its own.
+    """
+    if not problem.both:
+        return trusted(problem)
+    effects: Effects = [
+        (partial(_columns, c.form, c.shape), fitted.amplitudes(k)) for k, c in enumerate(fitted.chosen)
+    ]
+    friction = [
+        fitted.at_reversal(symbol, getattr(fitted.problem.base, field)) for field, symbol in REVERSALS.items()
+    ]
+    return trusted(sharpened(problem, [*effects, _gravity(fitted)], friction), effects)
+
+
+def _gravity(fitted: Fitted) -> tuple[Callable[[Motion], Terms], Array]:
+    """The baseline's gravity as an effect (both encoders)."""
+    first = fitted.problem.names.index("MX")
+    share = fitted.problem.base.K / fitted.problem.stiffness
+
+    def columns(m: Motion) -> Terms:
+        return Terms(load=m.gravity * np.column_stack([np.cos(m.joint_position), np.sin(m.joint_position)]))
+
+    return columns, share * fitted.basis.coefficients[first : first + 2]
+
+
+def _columns(form: Form, shape: tuple[float, ...], m: Motion) -> Terms:
+    return form.signature.columns(m, shape)
 
 
 def without(chosen: Sequence[Chosen], k: int) -> tuple[Chosen, ...]:

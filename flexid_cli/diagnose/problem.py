@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from flexid_cli.diagnose.mean_sign import FINE, between, mean_sign
 from flexid_cli.diagnose.rows import Complex, Taper, Weights, motor_only_noise, two_encoder_noise
 from flexid_cli.effects.motion import Base, Motion, Terms
 from flexid_cli.effects.signature import Scale
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Numbers = TypeVar("Numbers", Array, Complex)
 Part = Callable[["Stretch", Motion], Sequence["Complex | None"]]
+Sharpener = Callable[[Segment, float], tuple[Array, Array]]
+Effects = Sequence[tuple[Callable[[Motion], Terms], Array]]  # columns of effects and their amplitudes
 
 HALF_WIDTH = 12  # of the derivatives: exact to 1e-6 up to a third of the sampling rate
 MARGIN = 4 * HALF_WIDTH  # samples at the ends that derivatives of derivatives cannot reach
@@ -56,6 +59,8 @@ class Stretch:
     segment : Segment
     rate_hz, band_hz : float
         Sampling rate, and band of the rows.
+    sharpener : callable, optional
+        (segment, rate) -> the velocities whose sign is taken, in place of low-passed ones.
 
     Attributes
     ----------
@@ -67,7 +72,14 @@ class Stretch:
         Velocities whose sign is taken.
     """
 
-    def __init__(self, segment: Segment, rate_hz: float, band_hz: float) -> None:
+    def __init__(
+        self,
+        segment: Segment,
+        rate_hz: float,
+        band_hz: float,
+        sharpener: Sharpener | None = None,
+    ) -> None:
+        self.sharpener = sharpener
         self.rate_hz, self.period_s, self._band = rate_hz, 1.0 / rate_hz, band_hz
         self.torque, self.motor = segment.torque, segment.motor_position
         self.joint = np.empty(0) if segment.joint_position is None else segment.joint_position
@@ -77,10 +89,24 @@ class Stretch:
         self.taper = Taper.of(segment.samples, rate_hz, band_hz, MARGIN)
         self.motor_smooth = self.lowpass(self.motor, SMOOTH_BAND)
         self.motor_velocity = self.derivative(self.motor_smooth, 1)
-        self.motor_sharp = self.derivative(self.lowpass(self.motor, MOTOR_SIGN_BAND), 1)
         if self.joint.size:
             self.joint_smooth = self.lowpass(self.joint, SMOOTH_BAND)
+        if sharpener is not None:
+            fine = sharpener(segment, rate_hz)
+            (self.motor_sharp, self.joint_sharp), (self.motor_fine, self.joint_fine) = (
+                [v[::FINE] for v in fine],
+                fine,
+            )
+            return
+        self.motor_sharp = self.derivative(self.lowpass(self.motor, MOTOR_SIGN_BAND), 1)
+        self.motor_fine = between(self.motor_sharp)
+        if self.joint.size:
             self.joint_sharp = self.derivative(self.lowpass(self.joint, JOINT_SIGN_BAND), 1)
+            self.joint_fine = between(self.joint_sharp)
+
+    def like(self, segment: Segment) -> Stretch:
+        """The same stretch with other signals."""
+        return Stretch(segment, self.rate_hz, self._band, self.sharpener)
 
     @cached_property
     def motor_acceleration(self) -> Array:
@@ -129,7 +155,11 @@ class Stretch:
 
     def with_joint(self, joint: Array) -> Stretch:
         """The same stretch with another joint position."""
-        return Stretch(replace(self.segment, joint_position=joint), self.rate_hz, self._band)
+        return self.like(replace(self.segment, joint_position=joint))
+
+    def sharpened(self, sharpener: Sharpener) -> Stretch:
+        """The same stretch with another way to tell the velocities where they reverse."""
+        return Stretch(self.segment, self.rate_hz, self._band, sharpener)
 
     def lowpass(self, x: Array, over_band: float) -> Array:
         """Zero-phase low pass at a multiple of the rows' band."""
@@ -235,6 +265,7 @@ class Problem:
         self,
         base: Base,
         *,
+        stretches: Sequence[Stretch] | None = None,
         shift: float | None = None,
         applied: Mapping[Form, Array] | None = None,
         stiffening: float | None = None,
@@ -242,9 +273,10 @@ class Problem:
         trust: Sequence[Array] | None = None,
     ) -> Problem:
         """The same record linearised elsewhere, with other errors of the joint's position taken out."""
-        stretches = self.stretches
+        recorded = self.recorded if stretches is None else stretches
+        stretches = self.stretches if stretches is None else stretches
         if applied is not None and (applied or self.applied):
-            stretches = [_without_errors(s, applied) for s in self.recorded]
+            stretches = [_without_errors(s, applied) for s in recorded]
         other = Problem(
             stretches,
             base,
@@ -263,7 +295,7 @@ class Problem:
             led=self.led if led is None else led,
             trust=self.trust if trust is None else trust,
         )
-        other.recorded = self.recorded
+        other.recorded = recorded
         return other
 
     @property
@@ -304,7 +336,7 @@ class Problem:
     def spectral(self, stretch: Stretch) -> Complex:
         """Spectral matrix of the equations' noise and of what no model predicts, shape (frequencies, m, m)."""
         omega = 2.0 * np.pi * stretch.taper.frequency_hz
-        floor = (MODEL_FLOOR * self.torque_rms) ** 2 * 0.5 * stretch.rate_hz / self.band_hz
+        floor = self.floor(stretch.rate_hz)
         if self.both:
             return two_encoder_noise(self.base, self.noise, omega) + floor * np.eye(2)
         # What the model lacks at the motor passes 1 + X2 s + X1 s^2 as the torque itself does.
@@ -313,30 +345,37 @@ class Problem:
             motor_only_noise(self.base, self.noise, omega) + floor * (1.0 + passed)[:, None, None]
         )
 
+    def floor(self, rate_hz: float) -> float:
+        """Variance a sample of white noise that stands for what no model predicts."""
+        return (MODEL_FLOOR * self.torque_rms) ** 2 * 0.5 * rate_hz / self.band_hz
+
     def motion(self, s: Stretch) -> Motion:
         """Motion of a stretch at the linearisation."""
         base = self.base
-        motor_sign = reversal(s.motor_sharp, base.motor_reversal)
         if self.both:
-            joint, sharp = s.joint_smooth, s.joint_sharp
+            joint = s.joint_smooth
             velocity, acceleration = s.joint_derivatives
+            motor_sign = mean_sign(s.motor_fine, base.motor_reversal)
+            joint_sign = mean_sign(s.joint_fine, base.load_reversal)
         else:
+            motor_sign = reversal(s.motor_sharp, base.motor_reversal)
             friction = base.FVm * s.motor_velocity + base.FSm * s.lowpass(motor_sign, SMOOTH_BAND)
             inertial = base.Jm * s.motor_acceleration
             joint = s.motor_smooth - (s.torque_smooth - inertial - friction) / base.K
             joint = s.lowpass(joint, SMOOTH_BAND)
             velocity, acceleration = s.derivative(joint, 1), s.derivative(joint, 2)
             sharp = s.derivative(self._led(s), 1) if self.led else velocity
+            joint_sign = reversal(sharp, base.load_reversal)
         return Motion(
             time_s=s.time_s,
             torque=s.torque,
             motor_position=s.motor_smooth,
-            motor_velocity=s.motor_velocity,
+            motor_velocity=s.motor_velocity if s.sharpener is None else s.motor_sharp,
             joint_position=joint,
             joint_velocity=velocity,
             joint_acceleration=acceleration,
             motor_sign=motor_sign,
-            joint_sign=reversal(sharp, base.load_reversal),
+            joint_sign=joint_sign,
             deflection=s.motor_smooth - joint - base.torsion_zero,
             deflection_rate=s.motor_velocity - velocity,
             period_s=s.period_s,
@@ -453,11 +492,13 @@ class Problem:
         """Rows of one Coulomb column for another reversal width, shape (r,)."""
 
         def part(s: Stretch, m: Motion) -> list[Complex | None]:
-            if field == "motor_reversal":
-                sign = reversal(s.motor_sharp, width)
-                return self._one(s.spectrum(sign if self.both else self.through(s, sign)), "motor")
-            sharp = s.joint_sharp if self.both else m.joint_velocity
-            return self._one(s.spectrum(reversal(sharp, width)), "load")
+            motor = field == "motor_reversal"
+            if self.both:
+                sign = mean_sign(s.motor_fine if motor else s.joint_fine, width)
+                return self._one(s.spectrum(sign), "motor" if motor else "load")
+            if motor:
+                return [s.spectrum(self.through(s, reversal(s.motor_sharp, width)))]
+            return [s.spectrum(reversal(m.joint_velocity, width))]
 
         return self._rows(part)[:, 0]
 
@@ -491,7 +532,7 @@ class Problem:
 
         def part(s: Stretch, m: Motion) -> list[Complex | None]:
             seen.append(terms_of(m))
-            return (self._place_both if self.both else self._place_alone)(s, seen[-1])
+            return self.place(s, seen[-1])
 
         rows = self._rows(part)
         if not self.both or seen[0].transmission is None:
@@ -540,6 +581,10 @@ class Problem:
     def _torsion(self) -> Array:
         """Rows of a spring of unit stiffness, shape (r,)."""
         return self._rows(lambda s, m: self._place_both(s, Terms(transmission=m.deflection[:, None])))[:, 0]
+
+    def place(self, s: Stretch, t: Terms) -> list[Complex | None]:
+        """Spectra of what an effect adds to each equation."""
+        return (self._place_both if self.both else self._place_alone)(s, t)
 
     def _place_both(self, s: Stretch, t: Terms) -> list[Complex | None]:
         b = self.base

@@ -108,6 +108,11 @@ class Weights:
 
     def apply(self, columns: Sequence[Complex | None]) -> Array:
         """Rows of one or more columns, shape (equations, rows, k); None stands for zeros."""
+        out = self.plain(columns)
+        return out if self.trust is None else out * self.trust[:, :, None]
+
+    def plain(self, columns: Sequence[Complex | None]) -> Array:
+        """The rows without their trust."""
         from scipy.fft import irfft
 
         k = next(c.shape[1] for c in columns if c is not None)
@@ -121,8 +126,6 @@ class Weights:
                 mixed = part if mixed is None else mixed + part
             if mixed is not None:
                 out[i] = irfft(mixed, self.rows, axis=1, overwrite_x=True)[:, self._inside]
-        if self.trust is not None:
-            out *= self.trust[:, None]
         return out.swapaxes(1, 2)
 
     def back(self, rows: Array) -> Array:

@@ -166,6 +166,15 @@ class Search:
         best = min((self.evaluate(form, p, now) for p in points), key=lambda c: c.rank)
         return best if not shapes or best.refused else self.refine(best, now, TRIED)
 
+    def extended(self, form: Form, plain: Candidate, now: Basis) -> Candidate:
+        """A form that extends another one, searched about that one's best cycles and half of them.
+
+        The overtone may be the stronger one of two waves.
+        """
+        points = [plain.shape, tuple(0.5 * n for n in plain.shape)]
+        best = min((self.evaluate(form, p, now) for p in points), key=lambda c: c.rank)
+        return best if best.refused else self.refine(best, now, TRIED)
+
     def _ripples(self, form: Form, shape: Shape, now: Basis) -> list[tuple[float, ...]]:
         """Cycles at which a ripple over the motor's angle would explain most, by one transform over all of them."""
         cycles = shape.grid()

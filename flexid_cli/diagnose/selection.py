@@ -60,9 +60,11 @@ def select(fitter: Fitter, problems: Sequence[Problem]) -> Selection:
         new = _added(fitter, fitted, found)
         if new is None or new.gain(fitted) < enough:
             break
-        fitted = _needed(fitter, new, enough)
+        fitted = fitter.reweighted(_needed(fitter, new, enough))
         found = fitter.candidates(fitted)
     alternatives, rivals = _alternatives(fitter, fitted)
+    if fitted.chosen:
+        before = fitter.fit(before.problem.at(before.problem.base, trust=fitted.problem.trust))
     return Selection(before, fitted, alternatives, tuple(tested), rivals, elsewhere)
 
 

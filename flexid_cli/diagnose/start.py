@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import solve
-from flexid_cli.diagnose.fitter import Chosen, Fitter
+from flexid_cli.diagnose.fitter import Chosen, Fitter, informed
 from flexid_cli.diagnose.problem import SHORTEST_S, SMOOTH_BAND, Problem, Stretch
 from flexid_cli.diagnose.rows import motor_only_noise, two_encoder_noise
 from flexid_cli.diagnose.torque_noise import ABOVE, HIGHEST, MOST_FALL, torque_noise
@@ -94,7 +94,8 @@ def first_problems(
         rigid=rigid,
     )
     if both or rigid:
-        return [trusted(_with_torque_noise(fitter.relax(problem, rounds=1).problem))]
+        first = fitter.relax(problem, rounds=1)
+        return [informed(_with_torque_noise(first.problem), first)]
     known = _identified(recording, config, width) if fitted is None else fitted.base
     problems = _scanned(problem, fitter) if known is None else [problem.at(known)]
     for one in problems:
@@ -237,7 +238,7 @@ def _with_torque_noise(problem: Problem) -> Problem:
     """
     s = max(problem.stretches, key=lambda s: s.torque.size)
     found = None
-    if not (problem.both or problem.rigid):
+    if not problem.rigid:
         found = torque_noise(s.segment, s.rate_hz, problem.band_hz)
     if found is None:
         found = _above_the_band(problem, s)

@@ -1,8 +1,9 @@
-"""How far each row can be trusted where noise turns a sign.
+"""How far each row can be trusted where noise turns a sign, or where an effect amplifies it.
 
 Coulomb friction follows the sign of a velocity. About a standstill the encoder's noise is of the size of the
 velocity, and what it makes of the sign stands in the rows like noise that is there for a while: no stationary
-spectrum holds it.
+spectrum holds it. Nor does it hold what an effect makes of the noise: a joint that stiffens with its torsion passes
+more of the encoders' noise the more it is twisted, and a damper passes its rate.
 """
 
 from __future__ import annotations
@@ -12,47 +13,100 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.problem import Effects, Problem, Stretch
+from flexid_cli.effects.motion import Motion
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 REPLICAS, SEED = 4, 20010526
+REPLICAS_BOTH = 2  # both encoders: little is left that turns a sign
 WINDOW_S = 0.2  # over which the noise's power is averaged
+# Counts show in the steps from sample to sample: nearly all are a whole number of the smallest.
+MOST_COUNTS, LEAST_STEPS, WHOLE, MOSTLY = 100.0, 100, 0.02, 0.98
+OVER_COUNTS = 0.4  # noise over a count, which is 0.29 of counts alone
 
 
-def trusted(problem: Problem) -> Problem:
-    """The problem with every row weighted by what noise in the signs adds to it."""
+def trusted(problem: Problem, effects: Effects = ()) -> Problem:
+    """The problem with every row weighted by what noise adds to it through signs and ``effects``."""
     rng = np.random.default_rng(SEED)
-    draws = [_sign_noise(problem, rng) for _ in range(REPLICAS)]
     width = max(1, round(2.0 * problem.band_hz * WINDOW_S))
-    power = [np.mean(np.square(rows), axis=0) for rows in zip(*draws, strict=True)]
-    trust = [1.0 / np.sqrt(1.0 + _smoothed(p, width)) for p in power]
+    added = [_added_noise(problem, effects, rng) for _ in range(REPLICAS_BOTH if problem.both else REPLICAS)]
+    power = [np.mean(p, axis=0) for p in zip(*added, strict=True)]
+    trust = [1.0 / np.sqrt(1.0 + np.maximum(_smoothed(p, width), 0.0)) for p in power]
     return problem.at(problem.base, trust=trust)
 
 
-def _sign_noise(problem: Problem, rng: np.random.Generator) -> list[Array]:
-    """What one more draw of the signals' noise makes of the signs, shape (equations, rows), by stretch."""
-    b, out = problem.base, []
+def _added_noise(problem: Problem, effects: Effects, rng: np.random.Generator) -> list[Array]:
+    """Power that one more draw of the signals' noise adds to each row, shape (equations, rows), by stretch."""
+    out = []
     for s, m, w in zip(problem.stretches, problem.motions, problem.weights, strict=True):
-        noisy = problem.motion(_with_noise(s, problem, rng))
-        motor = b.FSm * (noisy.motor_sign - m.motor_sign)
-        load = b.FS * (noisy.joint_sign - m.joint_sign)
-        parts = [motor, load] if problem.both else [problem.through(s, motor) + load]
-        out.append(w.apply([s.spectrum(x) for x in parts])[:, :, 0])
+        noisy = _with_noise(s, problem, rng)
+        moved = problem.motion(noisy)
+        power = w.plain(_sign_noise(problem, s, m, moved))[:, :, 0] ** 2
+        if effects:
+            known = w.plain(_known_noise(problem, s, noisy))[:, :, 0]
+            through = [(columns(moved).since(columns(m)), amplitudes) for columns, amplitudes in effects]
+            changed = sum((w.plain(problem.place(s, t)) @ amplitudes for t, amplitudes in through), known)
+            power += changed**2 - known**2
+        out.append(power)
     return out
 
 
-def _with_noise(s: Stretch, problem: Problem, rng: np.random.Generator) -> Stretch:
-    def noise(sigma: float) -> Array:
-        return np.asarray(sigma * rng.standard_normal(s.torque.size))
+def _sign_noise(problem: Problem, s: Stretch, m: Motion, moved: Motion) -> list[Complex | None]:
+    """What noise makes of the signs, by equation."""
+    b = problem.base
+    motor = b.FSm * (moved.motor_sign - m.motor_sign)
+    load = b.FS * (moved.joint_sign - m.joint_sign)
+    return [s.spectrum(x) for x in ([motor, load] if problem.both else [problem.through(s, motor) + load])]
 
+
+def _known_noise(problem: Problem, s: Stretch, noisy: Stretch) -> list[Complex | None]:
+    """What the baseline makes of the same noise, which the rows' weights know of; with the sign of effects."""
+    b, e = problem.base, noisy.motor - s.motor
+    motor = s.torque - noisy.torque + b.Jm * s.derivative(e, 2) + b.FVm * s.derivative(e, 1)
+    if not problem.both:
+        load = b.JL * s.derivative(e, 2) + b.FV * s.derivative(e, 1)
+        return [s.spectrum(problem.through(s, motor) + load)]
+    joint = noisy.joint - s.joint
+    spring = b.K * (e - joint)
+    load = b.JL * s.derivative(joint, 2) + b.FV * s.derivative(joint, 1)
+    return [s.spectrum(motor + spring), s.spectrum(load - spring)]
+
+
+def _with_noise(s: Stretch, problem: Problem, rng: np.random.Generator) -> Stretch:
+    joint = None
+    torque = problem.noise.torque * rng.standard_normal(s.torque.size)
+    motor = _encoder_noise(s.motor, s.motor_smooth, problem.noise.motor_position, rng)
+    if problem.both:
+        joint = s.joint + _encoder_noise(s.joint, s.joint_smooth, problem.noise.joint_position, rng)
     segment = replace(
-        s.segment,
-        torque=s.torque + noise(problem.noise.torque),
-        motor_position=s.motor + noise(problem.noise.motor_position),
-        joint_position=s.joint + noise(problem.noise.joint_position) if problem.both else None,
+        s.segment, torque=s.torque + torque, motor_position=s.motor + motor, joint_position=joint
     )
-    return Stretch(segment, s.rate_hz, problem.band_hz)
+    return s.like(segment)
+
+
+def _encoder_noise(position: Array, smooth: Array, sigma: float, rng: np.random.Generator) -> Array:
+    """One more draw of an encoder's noise; of counts, where they are all there is of it.
+
+    About a standstill counts follow each other slowly, and their error is slow: white noise has too little of that.
+    """
+    count = count_of(position, sigma)
+    if count == 0.0:
+        return np.asarray(sigma * rng.standard_normal(position.size), dtype=np.float64)
+    passed = smooth + count * rng.random()
+    return np.asarray(count * np.round(passed / count) - passed, dtype=np.float64)
+
+
+def count_of(position: Array, sigma: float) -> float:
+    """One count of an encoder whose noise of ``sigma`` is that of its counts; zero where it is not."""
+    steps = np.abs(np.diff(position))
+    steps = steps[(steps > sigma) & (steps < MOST_COUNTS * sigma)]
+    if steps.size < LEAST_STEPS:
+        return 0.0
+    count = float(steps.min())
+    whole = np.abs(steps / count - np.round(steps / count)) < WHOLE
+    return count if np.mean(whole) > MOSTLY and sigma < OVER_COUNTS * count else 0.0
 
 
 def _smoothed(power: Array, width: int) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,6 +107,11 @@ class Terms:
     load: Array | None = None
     motor_error: Array | None = None
     joint_error: Array | None = None
+
+    def since(self, before: Terms) -> Terms:
+        """What has changed from other terms of the same effect."""
+        pairs = {f.name: (getattr(before, f.name), getattr(self, f.name)) for f in fields(Terms)}
+        return Terms(**{n: None if a is None else b - a for n, (a, b) in pairs.items()})
 
 
 @dataclass(frozen=True)

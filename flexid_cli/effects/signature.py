@@ -95,8 +95,10 @@ class Signature:
         (joint position as recorded, amplitudes, derivative) -> the position that the effect leaves when it is taken
         out; with it the equations are linearised about the true motion. ``derivative(x, order)``.
     ripple : {"motor", "transmission", ""}
-        Equation in which the columns are `forms.sines` of the motor's position with the shape as cycles per
-        radian: such a search can be made at once for all cycles.
+        Equation in which the (first two) columns are `forms.sines` of the motor's position with the shape as cycles
+        per radian: such a search can be made at once for all cycles.
+    extends : bool
+        Whether it is a ripple's form before it with an overtone: taken where it explains clearly more.
     needs_joint : bool
         Whether it is looked for with both encoders only.
     motor_alone : bool
@@ -115,6 +117,7 @@ class Signature:
     tied: Callable[[Array, Sequence[float], Base], str] | None = None
     corrected: Callable[[Array, Array, Callable[[Array, int], Array]], Array] | None = None
     ripple: str = ""
+    extends: bool = False
     needs_joint: bool = False
     motor_alone: bool = False
     form_doubt: float = 0.0

@@ -71,7 +71,7 @@ def _run(drive, transition, force, start, coulomb, width, substeps):  # type: ig
         for k in range(substeps):
             torque = drive[i] + change * (k + 0.5) / substeps
             free = transition[1, 0] * q + transition[1, 1] * v + force[1] * torque
-            friction = _friction(free, v, force[1] * coulomb, width) * coulomb
+            friction = friction_sign(free, v, force[1] * coulomb, width) * coulomb
             position_next = transition[0, 0] * q + transition[0, 1] * v + force[0] * (torque - friction)
             v = free - force[1] * friction
             q = position_next
@@ -80,7 +80,7 @@ def _run(drive, transition, force, start, coulomb, width, substeps):  # type: ig
 
 
 @njit(cache=True)
-def _friction(free, v, gain, width):  # type: ignore[no-untyped-def] # pragma: no cover
+def friction_sign(free, v, gain, width):  # type: ignore[no-untyped-def] # pragma: no cover
     """Sign at the end x of a step, x = free - gain tanh(x / width), by Newton steps kept inside a bracket."""
     low, high = free - abs(gain), free + abs(gain)
     x = min(max(v, low), high)

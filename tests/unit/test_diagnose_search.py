@@ -119,10 +119,21 @@ def test_ripple_search_finds_the_cycles_of_a_planted_sine(search, name, cycles):
     now = planted(search, form(name), (cycles,), waves)
     candidate = found(search, form(name), now)
     assert candidate.shape[0] == pytest.approx(cycles, abs=0.03)  # one turn over the travel is two
-    size_name, _, phase_name = (p.name for p in effect(name).parameters)
+    size_name, _, phase_name = (p.name for p in effect(name).parameters[:3])
     assert values(search, candidate)[size_name] == pytest.approx(size, rel=0.05)
     assert values(search, candidate)[phase_name] == pytest.approx(phase, abs=0.05)
     assert candidate.gain > 0.5
+
+
+@pytest.mark.parametrize("second", [0.2, 1.5])
+def test_the_overtone_of_a_ripple_is_found_with_it(search, second):
+    """Also where it is the stronger one of the two waves, so that the plain form finds it alone."""
+    plain, both = (f for f in FORMS if f.name == "cogging")
+    now = planted(search, both, (14.3,), [0.4, 0.0, second * 0.4, 0.0])
+    candidate = search.extended(both, found(search, plain, now), now)
+    assert candidate.shape[0] == pytest.approx(14.3, abs=0.03)
+    assert values(search, candidate)["cogging_torque"] == pytest.approx(0.4, rel=0.05)
+    assert values(search, candidate)["second_torque"] == pytest.approx(second * 0.4, rel=0.05)
 
 
 def test_a_record_that_hardly_moves_shows_no_ripple(search):
