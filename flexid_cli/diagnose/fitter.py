@@ -196,7 +196,7 @@ class Fitter:
     def settled(self, fitted: Fitted) -> Fitted:
         """The same model linearised where its own fit is.
 
-        Only there an effect has one amplitude in both equations; elsewhere the cost may be lower, the stiffness wrong.
+        Only there an effect has one amplitude in both equations; elsewhere the cost may be lower and K is wrong.
         """
         for _ in range(SETTLING_STEPS):
             base = self.moved(fitted)
