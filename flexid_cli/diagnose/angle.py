@@ -11,7 +11,7 @@ an F distribution. The false-alarm probability holds for all lines searched toge
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,12 +104,14 @@ def spectrum(
     found: list[AngleLine] = []
     left, searched = e, grid >= FIRST * angles.step
     for _ in range(MOST):
+        before = float(left @ left)
         ratio = np.where(searched, power / level, 0.0)
         k = int(np.argmax(ratio))
         chance = false_alarm(float(ratio[k]), grid.size / OVERSAMPLED)
         if chance > ALPHA:
             break
         line, left = _line(float(grid[k]), left, angles, rows, chance)
+        line = replace(line, share=line.share * before / max(float(e @ e), 1e-300))
         found += [line] if line.amplitude > SURE * line.stderr else []
         searched &= np.abs(grid - grid[k]) > APART * angles.step
         power = np.square(np.abs(_sums(left, angles, grid)))

@@ -60,7 +60,12 @@ def figure_angle(found: tuple[AngleSpectrum, ...]) -> str:
         for axes, one in zip(rows, found, strict=True):
             axes.plot(one.cycles, one.amplitude, color=RESIDUAL, linewidth=0.9, label="residual")
             axes.plot(
-                one.cycles, one.level, color=MEASURED, linewidth=1.0, linestyle="--", label="noise, 1 % level"
+                one.cycles,
+                one.level,
+                color=MEASURED,
+                linewidth=1.0,
+                linestyle="--",
+                label="1 % level of noise beside the lines",
             )
             axes.set_yscale("log")
             axes.set_ylabel(f"{one.equation} ({one.unit})")

@@ -117,11 +117,9 @@ def line_rows(found: Mapping[str, Any]) -> Rows:
 
 
 def loop_rows(found: Mapping[str, Any]) -> Rows:
-    """Frequency, loss stiffness, half width of its band, loop's width; nothing where no band shows a loop."""
+    """Frequency, loss stiffness, half width of its band, loop's width; nothing where there is no loop."""
     loop = found["loop"]
-    if loop is None or not any(
-        None not in (x, half) and x > half for x, half in zip(loop["stiffness"], loop["band"], strict=True)
-    ):
+    if loop is None or loop["slope"] is None:
         return []
     cells = zip(loop["frequency_hz"], loop["stiffness"], loop["band"], loop["width"], strict=True)
     return [tuple(_number(x) for x in row) for row in cells]

@@ -221,6 +221,8 @@ def test_two_lines_are_found_with_amplitude_and_phase():
     assert first.cycles_per_motor_revolution == pytest.approx(2.3, abs=0.015)
     assert first.amplitude == pytest.approx(1.0, abs=0.15)
     assert second.amplitude == pytest.approx(0.6, abs=0.15)
+    assert first.share + second.share < 1.0
+    assert first.share > 2.0 * second.share
     assert first.phase == pytest.approx(0.4, abs=0.3)
     assert max(first.false_alarm, second.false_alarm) < ANGLE_ALPHA
     at = int(np.argmin(np.abs(found.cycles - 23.0)))
