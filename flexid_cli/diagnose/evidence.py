@@ -16,7 +16,9 @@ from flexid_cli.diagnose.search import Search
 Array = NDArray[np.float64]
 
 BLOCKS = 24  # of the score test: long against the residual's correlation, many enough for Student's t
-FOLDS = 5  # of the record, each predicted from the others
+# Blocks of the record that are predicted from the others, every fifth of them at once: what a sweep passes in one block
+# its neighbours pass too, or the prediction would be one of frequencies that were never seen.
+FOLDS, FOLD_BLOCKS = 5, 20
 STABILITY_BLOCKS = 6
 
 
@@ -59,16 +61,15 @@ def _blocks(values: Array, problem: Problem, count: int) -> Array:
 
 
 def cross_validated(fitted: Fitted) -> Array:
-    """Residual rows of a model, each fifth of the record predicted from the rest (with a gap between)."""
+    """Residual rows of a model, every fifth block of the record predicted from the rest (with gaps between)."""
     rows, columns = fitted.y.size // fitted.problem.equations, fitted.basis.columns
     time = np.arange(rows)
-    fold = np.minimum(time * FOLDS // rows, FOLDS - 1)
+    fold = (time * FOLD_BLOCKS // rows) % FOLDS
     gap = max(2, rows // 200)
     residual = np.empty_like(fitted.y)
     for f in range(FOLDS):
         inside = fold == f
-        first, last = np.flatnonzero(inside)[[0, -1]]
-        away = (time < first - gap) | (time > last + gap)
+        away = np.convolve(inside, np.ones(2 * gap + 1), "same") < 0.5
         train, test = np.tile(away, fitted.problem.equations), np.tile(inside, fitted.problem.equations)
         coefficients = solve(columns[train], fitted.y[train]).coefficients
         residual[test] = fitted.y[test] - columns[test] @ coefficients
