@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import solve
 from flexid_cli.diagnose.fitter import Fitted, Fitter, without
+from flexid_cli.diagnose.led import LedFit
+from flexid_cli.diagnose.led import predicted as led_rows
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.search import Search
 
@@ -77,6 +79,8 @@ def cross_validated(fitted: Fitted) -> Array:
 
 def predicted(problem: Problem, fitter: Fitter, fitted: Fitted) -> Array:
     """Residual rows of another record with all parameters of ``fitted``."""
+    if isinstance(fitted, LedFit) and (led := led_rows(problem, fitted)) is not None:
+        return led
     here = fitted.problem
     other = problem.at(
         here.base, shift=here.shift, applied=here.applied, stiffening=here.stiffening, led=here.led

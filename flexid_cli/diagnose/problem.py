@@ -336,7 +336,7 @@ class Problem:
 
         def part(s: Stretch, m: Motion) -> list[Complex | None]:
             torque = s.torque if self.both else self.through(s, s.torque)
-            spectrum = _later(s, s.spectrum(torque), late)
+            spectrum = later(s, s.spectrum(torque), late)
             if self.both:
                 return [spectrum, s.spectrum(self._spring(s))]
             b = self.base
@@ -619,7 +619,7 @@ def _without_errors(s: Stretch, applied: Mapping[Form, Array]) -> Stretch:
     return s if joint is s.joint else s.with_joint(joint)
 
 
-def _later(s: Stretch, spectrum: Complex, periods: float) -> Complex:
+def later(s: Stretch, spectrum: Complex, periods: float) -> Complex:
     """A torque that acts later; half a period is a hold, which a sinc damps (and whose undoing lifts)."""
     if periods == 0.0:
         return spectrum
