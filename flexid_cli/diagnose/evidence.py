@@ -10,14 +10,16 @@ from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import solve
 from flexid_cli.diagnose.fitter import Fitted, Fitter, informed, without
+from flexid_cli.diagnose.led import LedFit
+from flexid_cli.diagnose.led import predicted as led_rows
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.search import Search
 
 Array = NDArray[np.float64]
 
 BLOCKS = 24  # of the score test: long against the residual's correlation, many enough for Student's t
-# Blocks of the record that are predicted from the others, every fifth of them at once: what a sweep passes in one block
-# its neighbours pass too, or the prediction would be one of frequencies that were never seen.
+# Blocks of the record that are predicted from the others, every fifth of them at once: what a sweep passes in one
+# block its neighbours pass too, or the prediction would be one of frequencies that were never seen.
 FOLDS, FOLD_BLOCKS = 5, 20
 STABILITY_BLOCKS = 6
 
@@ -78,6 +80,8 @@ def cross_validated(fitted: Fitted) -> Array:
 
 def predicted(problem: Problem, fitter: Fitter, fitted: Fitted) -> Array:
     """Residual rows of another record with all parameters of ``fitted``."""
+    if isinstance(fitted, LedFit) and (led := led_rows(problem, fitted)) is not None:
+        return led
     here = fitted.problem
     other = problem.at(
         here.base, shift=here.shift, applied=here.applied, stiffening=here.stiffening, led=here.led

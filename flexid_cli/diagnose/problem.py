@@ -422,12 +422,12 @@ class Problem:
 
         def part(s: Stretch, m: Motion) -> list[Complex | None]:
             if self.both:
-                return [_later(s, s.both_spectra["torque"], late), self.stiffness * self._twist(s)]
+                return [later(s, s.both_spectra["torque"], late), self.stiffness * self._twist(s)]
             known, b = s.alone_spectra, self.base
             acceleration, velocity = known["acceleration"], known["velocity"]
             motor = b.Jm * acceleration + b.FVm * velocity + b.FSm * s.differentiated(m.motor_sign)
             load = b.JL * acceleration[:, :1] + b.FV * velocity[:, :1] + b.FS * s.spectrum(m.joint_sign)
-            return [_later(s, self._passed(known["torque"]), late) - self._passed(motor) - load]
+            return [later(s, self._passed(known["torque"]), late) - self._passed(motor) - load]
 
         return self._rows(part)[:, 0]
 
@@ -720,7 +720,7 @@ def _without_errors(s: Stretch, applied: Mapping[Form, Array]) -> Stretch:
     return s if joint is s.joint else s.with_joint(joint)
 
 
-def _later(s: Stretch, spectrum: Complex, periods: float) -> Complex:
+def later(s: Stretch, spectrum: Complex, periods: float) -> Complex:
     """A torque that acts later; half a period is a hold, which a sinc damps (and whose undoing lifts)."""
     if periods == 0.0:
         return spectrum

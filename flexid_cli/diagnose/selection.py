@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter, without
+from flexid_cli.diagnose.led import LedFit, refined
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.search import Candidate
 from flexid_cli.threads import side_by_side
@@ -18,8 +19,14 @@ NEAR_RIVAL = 0.5  # of the best candidate's gain
 # Least gain (logarithm of the cost) of an effect, and what an alternative may be worse by. Calibrated, see
 # docs/diagnosis.md.
 ENOUGH = 0.12
-ENOUGH_ALONE = 0.4  # flexible, without a joint encoder
+ENOUGH_ALONE = 0.25  # flexible, without a joint encoder: of the linear fit, whose columns are noisy
+ENOUGH_LED = 0.12  # of fits by simulation
 AS_GOOD = 0.05
+# Loss by which a simulation may be worse than the linear fit, which noise in its columns makes look better.
+NO_WORSE = 0.5
+WORTH_A_SIMULATION = 0.3  # loss that an alternative may be behind before it is simulated
+# Of several starts: those looked at with effects, how far behind they may be, and steps by simulation.
+MOST_LIKELY, FAR_BEHIND, FEW_STEPS = 3, 1.5, 2
 LOOKED_AT = 0.6  # gain that a rival may be behind before its own refit
 
 
@@ -52,45 +59,115 @@ class Selection:
 def select(fitter: Fitter, problems: Sequence[Problem]) -> Selection:
     """Search the library for what the record holds beyond the baseline, from the likeliest of some linearisations."""
     problem, elsewhere = _start(fitter, problems)
-    enough = threshold(problem)
     before = fitter.relax(problem)
-    fitted, tested = before, fitter.candidates(before)
-    found = tested
-    while len(fitted.chosen) < MOST_EFFECTS:
-        new = _added(fitter, fitted, found)
-        if new is None or new.gain(fitted) < enough:
-            break
-        fitted = fitter.reweighted(_needed(fitter, new, enough))
-        found = fitter.candidates(fitted)
-    alternatives, rivals = _alternatives(fitter, fitted)
-    if fitted.chosen:
+    tested = fitter.candidates(before)
+    if problem.both or problem.rigid:
+        fitted = _grown(fitter, before, tested)
+    else:
+        fitted = _grown_led(fitter, _simulated(fitter, before) or before, tested)
+        before = before if fitted.chosen else fitted
+    fitted, alternatives, rivals = _alternatives(fitter, fitted)
+    if not (problem.both or problem.rigid):
+        # Where the baseline stands at a wrong stiffness, no simulation follows the record.
+        settled = isinstance(fitted, LedFit) or (fitted.problem.settled and not _denied(fitted))
+        fitted.problem.settled = before.problem.settled = settled
+    elif fitted.chosen:
         before = fitter.fit(before.problem.at(before.problem.base, trust=fitted.problem.trust))
     return Selection(before, fitted, alternatives, tuple(tested), rivals, elsewhere)
+
+
+def _grown(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
+    """The model with the effects that the record holds."""
+    enough = threshold(fitted.problem)
+    while len(fitted.chosen) < MOST_EFFECTS:
+        trials = _added(fitter, fitted, found)
+        if not trials or trials[0].gain(fitted) < enough:
+            break
+        fitted = fitter.reweighted(_needed(fitter, trials[0], enough))
+        found = fitter.candidates(fitted)
+    return fitted
+
+
+def _grown_led(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
+    """The same with the motor alone: the linear fit proposes, with its noisy columns, and the simulation decides.
+
+    A model at a wrong stiffness, and an effect that only stands in for another, are denied by it.
+    """
+    while len(fitted.chosen) < MOST_EFFECTS:
+        trials = _added(fitter, fitted, found)
+        trials = [
+            f
+            for f in trials
+            if f.gain(fitted) > ENOUGH_ALONE and f.loss - trials[0].loss < WORTH_A_SIMULATION
+        ]
+        simulated = [s for f in trials if (s := _simulated(fitter, f))]
+        if not simulated and trials and not isinstance(fitted, LedFit):
+            simulated = trials[:1]
+        new = min(simulated, key=lambda f: f.loss, default=None)
+        if new is None or new.gain(fitted) < ENOUGH_LED:
+            break
+        fitted = _confirmed(fitter, new) if len(new.chosen) > 1 else new
+        found = fitter.candidates(fitted)
+    return fitted
+
+
+def _simulated(fitter: Fitter, fitted: Fitted) -> Fitted | None:
+    """A fit by simulation, or itself where an effect has no law; None where the axis that it says does not do so."""
+    if _lawless(fitted):
+        return fitted
+    new = refined(fitter, fitted)
+    return None if new is None or new.loss - fitted.loss > NO_WORSE else new
+
+
+def _lawless(fitted: Fitted) -> bool:
+    return any(c.form.signature.lawless for c in fitted.chosen)
+
+
+def _denied(fitted: Fitted) -> bool:
+    """Whether no simulation does what a fit says."""
+    return not isinstance(fitted, LedFit) and not _lawless(fitted)
+
+
+def _confirmed(fitter: Fitter, fitted: Fitted) -> Fitted:
+    """Without effects that the others, by simulation, make needless."""
+    for k in reversed(range(len(fitted.chosen) - 1)):
+        less = _simulated(fitter, fitter.relax(fitted.problem, without(fitted.chosen, k), rounds=1))
+        if less is not None and fitted.gain(less) < ENOUGH_LED:
+            fitted = less
+    return fitted
 
 
 def _start(fitter: Fitter, problems: Sequence[Problem]) -> tuple[Problem, tuple[Fitted, ...]]:
     """Of several linearisations the most likely one, and the fits at others that the record cannot exclude.
 
     What the baseline lacks draws its stiffness to where it stands in for it: without an effect the likelihood says
-    little about where to begin. So each is judged with the one effect that explains most there.
+    little about where to begin. So each is judged with the one effect that explains most there, and by simulation:
+    eq. (18) at a wrong stiffness explains noise, a simulation does not.
     """
     if len(problems) == 1:
         return problems[0], ()
-    fits = side_by_side(lambda problem: _alone_or_with_one(fitter, problem), problems)
-    found = [(problem, fit) for problem, fit in zip(problems, fits, strict=True) if fit is not None]
+    plain = side_by_side(lambda problem: fitter.relax(problem, rounds=1), problems)
+    possible = [f for f in plain if f.is_possible]
+    simulated = side_by_side(lambda f: _led(fitter, f), possible)
+    likely = sorted(zip(possible, simulated, strict=True), key=lambda s: s[1].loss)
+    found = []
+    for fitted, led in likely[:MOST_LIKELY]:
+        if led.loss - likely[0][1].loss > FAR_BEHIND:
+            break
+        more = [f for f in _added(fitter, fitted, fitter.candidates(fitted))[:1] if f.is_possible]
+        found.append(min([led, *(_led(fitter, f) for f in more)], key=lambda f: f.loss))
     if not found:
         return problems[0], ()
-    best, fit = min(found, key=lambda start: start[1].loss)
-    near = [f for p, f in found if p is not best and f.loss - fit.loss < threshold(best)]
-    return best, tuple(near)
+    best = min(found, key=lambda f: f.loss)
+    near = [f for f in found if f is not best and f.loss - best.loss < threshold(best.problem)]
+    problem = best.problem.at(best.problem.base)
+    problem.anchor = problem.base
+    return problem, tuple(near)
 
 
-def _alone_or_with_one(fitter: Fitter, problem: Problem) -> Fitted | None:
-    """The baseline from a start, or it with the effect that explains most there; None where neither is possible."""
-    fitted = fitter.relax(problem, rounds=1)
-    both = (fitted, _added(fitter, fitted, fitter.candidates(fitted)))
-    possible = [f for f in both if f is not None and f.is_possible]
-    return min(possible, key=lambda f: f.loss) if possible else None
+def _led(fitter: Fitter, fitted: Fitted) -> Fitted:
+    """A fit after a few steps by simulation, or itself where there is no such axis."""
+    return refined(fitter, fitted, most=FEW_STEPS) or fitted
 
 
 def threshold(problem: Problem) -> float:
@@ -98,16 +175,14 @@ def threshold(problem: Problem) -> float:
     return ENOUGH if problem.both or problem.rigid else ENOUGH_ALONE
 
 
-def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted | None:
-    """The model with one more effect: of those that promise most, the one that is best after its own refit."""
+def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> list[Fitted]:
+    """The model with one more effect: those that promise most, after a refit each, the best first."""
     possible = [c for c in found if not c.refused]
-    if not possible or possible[0].gain <= 0.0:
-        return None
+    if not possible or possible[0].gain < 0.5 * ENOUGH:
+        return []
     rivals = [c for c in possible if c.gain > NEAR_RIVAL * possible[0].gain][:RIVALS]
-    if possible[0].gain < 0.5 * ENOUGH:
-        return None
     trials = fitter.relaxed(fitted, [(*fitted.chosen, Chosen(c.form, c.shape)) for c in rivals])
-    return min(trials, key=lambda f: f.loss)
+    return sorted(trials, key=lambda f: f.loss)
 
 
 def _needed(fitter: Fitter, fitted: Fitted, enough: float) -> Fitted:
@@ -123,15 +198,32 @@ def _needed(fitter: Fitter, fitted: Fitted, enough: float) -> Fitted:
 
 def _alternatives(
     fitter: Fitter, fitted: Fitted
-) -> tuple[tuple[tuple[Fitted, ...], ...], tuple[tuple[tuple[str, float], ...], ...]]:
-    """What explains the record as well in place of each chosen effect."""
+) -> tuple[Fitted, tuple[tuple[Fitted, ...], ...], tuple[tuple[tuple[str, float], ...], ...]]:
+    """The model, and what explains the record as well in place of each chosen effect.
+
+    With the motor alone, another effect can be the better one once it is simulated: then it is the model's.
+    """
+    alone = not (fitted.problem.both or fitted.problem.rigid)
     alternatives, rivals = [], []
-    for k, chosen in enumerate(fitted.chosen):
-        others = [c for c in fitter.candidates(fitted, instead_of=k) if c.form.name != chosen.name]
-        worse = [(c.form.name, float(np.log(c.cost / fitted.cost))) for c in others]
-        near = [c for c, (_, w) in zip(others, worse, strict=True) if w < LOOKED_AT and not c.refused]
-        rest = without(fitted.chosen, k)
-        refits = fitter.relaxed(fitted, [(*rest, Chosen(c.form, c.shape)) for c in near])
+    for k in range(len(fitted.chosen)):
+        refits, worse = _others(fitter, fitted, k, WORTH_A_SIMULATION if alone else AS_GOOD)
+        if alone:
+            refits = [s for f in refits if (s := _simulated(fitter, f))]
+        if alone and len(fitted.chosen) == 1 and refits:
+            own = [] if _denied(fitted) else [fitted]
+            fitted, *refits = sorted([*own, *refits], key=lambda f: f.loss)
         alternatives.append(tuple(f for f in refits if f.loss - fitted.loss < AS_GOOD))
         rivals.append(tuple(sorted(worse, key=lambda w: w[1])))
-    return tuple(alternatives), tuple(rivals)
+    return fitted, tuple(alternatives), tuple(rivals)
+
+
+def _others(
+    fitter: Fitter, fitted: Fitted, k: int, as_good: float
+) -> tuple[list[Fitted], list[tuple[str, float]]]:
+    """Other effects in place of the k-th after a refit, where they are nearly as good; what each is worse by."""
+    others = [c for c in fitter.candidates(fitted, instead_of=k) if c.form.name != fitted.chosen[k].name]
+    worse = [(c.form.name, float(np.log(c.cost / fitted.cost))) for c in others]
+    near = [c for c, (_, w) in zip(others, worse, strict=True) if w < LOOKED_AT and not c.refused]
+    rest = without(fitted.chosen, k)
+    refits = fitter.relaxed(fitted, [(*rest, Chosen(c.form, c.shape)) for c in near])
+    return [f for f in refits if f.loss - fitted.loss < as_good], worse

@@ -107,6 +107,8 @@ class Signature:
         Share of its stiffness that its form leaves open: K is no surer than that.
     rotary : bool
         Whether a linear axis has none.
+    lawless : bool
+        Whether the effect's torque law cannot do what this form does, so that no simulation can speak against it.
     """
 
     columns: Callable[[Motion, Sequence[float]], Terms]
@@ -122,3 +124,4 @@ class Signature:
     motor_alone: bool = False
     form_doubt: float = 0.0
     rotary: bool = False
+    lawless: bool = False

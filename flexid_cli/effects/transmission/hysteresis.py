@@ -123,7 +123,7 @@ EFFECT = Effect(
     guards=1,
     signatures=(
         Signature(_dahl_columns, _values, _shapes, sign=1, form_doubt=FORM_DOUBT),
-        Signature(_slip_columns, _values, _shapes, sign=1, form_doubt=FORM_DOUBT),
-        Signature(_sliders_columns, _sliders_values, _shapes, sign=1, form_doubt=FORM_DOUBT),
+        Signature(_slip_columns, _values, _shapes, sign=1, form_doubt=FORM_DOUBT, lawless=True),
+        Signature(_sliders_columns, _sliders_values, _shapes, sign=1, form_doubt=FORM_DOUBT, lawless=True),
     ),
 )

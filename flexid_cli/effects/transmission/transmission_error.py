@@ -70,5 +70,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.KINEMATICS, _kinematics),),
     energy="conserves",
-    signatures=(Signature(_columns, _values, _shapes, ripple="transmission"),),
+    signatures=(Signature(_columns, _values, _shapes, ripple="transmission", lawless=True),),
 )
