@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 SETTLED = 1e-3  # change of the cost's logarithm
 # Of the logarithm of a reversal width about the present one: its range, where it is looked at first, and how near.
 WIDTH_RANGE, WIDTH_STEP, WIDTH_NEAR, MOST_WIDTHS = 1.2, 0.4, 0.02, 6
+NEAR = 0.03  # of the search's steps: an instant of change is told to a sample
 REVERSALS = {"motor_reversal": "FSm", "load_reversal": "FS"}  # widths of the base and their friction
 REVERSAL = 3.0  # widths about zero velocity that a reversal takes
 NARROWEST = 1e-5  # reversal width, rad/s or m/s
@@ -191,12 +192,13 @@ class Fitter:
         """The same model with reversals and weights of rows that know of its effects (both encoders)."""
         if not fitted.problem.both:
             return fitted
-        return self.settled(self.relax(informed(fitted.problem, fitted), fitted.chosen, rounds=1))
+        relaxed = self.relax(informed(fitted.problem, fitted), fitted.chosen, rounds=1)
+        return self.settled(self._shapes(relaxed, NEAR))
 
     def settled(self, fitted: Fitted) -> Fitted:
-        """The same model linearised where its own fit is.
+        """The same model linearised where its own fit is: only there an effect has one amplitude in both equations.
 
-        Only there an effect has one amplitude in both equations; elsewhere the cost may be lower and K is wrong.
+        Elsewhere the cost may be lower, and the stiffness is another one.
         """
         for _ in range(SETTLING_STEPS):
             base = self.moved(fitted)
@@ -261,13 +263,14 @@ class Fitter:
 
         return min(self.shifts, key=cost)
 
-    def _shapes(self, fitted: Fitted) -> Fitted:
-        """Refine the shapes of all effects, one after the other, given the rest."""
+    def _shapes(self, fitted: Fitted, reach: float = 1.0) -> Fitted:
+        """Refine the shapes of all effects, one after the other, given the rest; ``reach`` as in `Search.refine`."""
         for k, c in enumerate(fitted.chosen):
             if not fitted.search.shapes(c.form):
                 continue
             rest = self.fit(fitted.problem, without(fitted.chosen, k), fitted.search)
-            best = fitted.search.refine(fitted.search.evaluate(c.form, c.shape, rest.basis), rest.basis)
+            now = fitted.search.evaluate(c.form, c.shape, rest.basis)
+            best = fitted.search.refine(now, rest.basis, reach=reach)
             chosen = (*fitted.chosen[:k], Chosen(c.form, best.shape), *fitted.chosen[k + 1 :])
             fitted = self.fit(fitted.problem, chosen, fitted.search)
         return fitted
@@ -290,18 +293,17 @@ class Fitter:
         for c in found:
             if c.form.name not in by_name or c.rank < by_name[c.form.name].rank:
                 by_name[c.form.name] = c
-        for f in self.forms:
-            if f.signature.extends and f.name in by_name:
-                by_name[f.name] = _extended(fitted.search, f, by_name[f.name], now.basis)
+        for name in {f.name for f in self.forms if f.signature.extends} & set(by_name):
+            by_name[name] = self.richest(now, by_name[name])
         return sorted(by_name.values(), key=lambda c: c.rank)
 
-
-def _extended(search: Search, form: Form, plain: Candidate, now: Basis) -> Candidate:
-    """The richer form of an effect where it explains clearly more than the plain one."""
-    if plain.refused or plain.gain < PROMISING:
-        return plain
-    richer = search.extended(form, plain, now)
-    return richer if not richer.refused and richer.gain - plain.gain > EXTENDED else plain
+    def richest(self, now: Fitted, plain: Candidate) -> Candidate:
+        """The form that extends a candidate's, where it explains clearly more."""
+        richer = [f for f in self.forms if f.name == plain.form.name and f.signature.extends]
+        if not richer or plain.refused or plain.gain < PROMISING:
+            return plain
+        found = now.search.extended(richer[0], plain, now.basis)
+        return found if not found.refused and found.gain - plain.gain > EXTENDED else plain
 
 
 def informed(problem: Problem, fitted: Fitted) -> Problem:

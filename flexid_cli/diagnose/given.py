@@ -163,14 +163,16 @@ def _joined(fitter: Fitter, fitted: Fitted, names: Sequence[str]) -> tuple[Fitte
             return fitted, why
         name, best = min(possible.items(), key=lambda item: item[1].cost)
         fitted = fitter.relax(fitted.problem, (*fitted.chosen, Chosen(best.form, best.shape)), rounds=2)
+        fitted = fitter.reweighted(fitted)
         left.remove(name)
     return fitted, {}
 
 
 def _best(fitter: Fitter, now: Fitted, name: str) -> Candidate | None:
     """The best form of an effect against what a model leaves."""
-    found = [now.search.best(f, now.basis) for f in fitter.forms if f.name == name]
-    return min((c for c in found if c is not None), key=lambda c: c.rank, default=None)
+    plain = [f for f in fitter.forms if f.name == name and not f.signature.extends]
+    found = [c for c in (now.search.best(f, now.basis) for f in plain) if c is not None]
+    return fitter.richest(now, min(found, key=lambda c: c.rank)) if found else None
 
 
 def _searched_again(fitter: Fitter, fitted: Fitted, names: Sequence[str]) -> Fitted:
@@ -183,6 +185,6 @@ def _searched_again(fitter: Fitter, fitted: Fitted, names: Sequence[str]) -> Fit
         if best is None or best.refused or best.cost > (1.0 - RESEARCHED) * fitted.cost:
             continue
         moved = (*fitted.chosen[:k], Chosen(best.form, best.shape), *fitted.chosen[k + 1 :])
-        other = fitter.relax(fitted.problem, moved)
+        other = fitter.reweighted(fitter.relax(fitted.problem, moved))
         fitted = other if other.loss < fitted.loss else fitted
     return fitted

@@ -16,7 +16,7 @@ FULL = 20.0  # widths beyond which a sign is one, to the last digit
 def between(velocity: Array) -> Array:
     """A velocity at `FINE` steps a period, straight between its samples."""
     at = np.arange(FINE * (velocity.size - 1) + 1) / FINE
-    return np.interp(at, np.arange(velocity.size), velocity)
+    return np.asarray(np.interp(at, np.arange(velocity.size), velocity), dtype=np.float64)
 
 
 def mean_sign(fine: Array, width: float) -> Array:
@@ -31,8 +31,8 @@ def mean_sign(fine: Array, width: float) -> Array:
         The velocity, `FINE` steps a period.
     width : float
     """
-    mean: Array = _means(np.ascontiguousarray(fine), width)
-    out = mean.copy()
+    mean = _means(np.ascontiguousarray(fine), width)
+    out = np.array(mean, dtype=np.float64)
     out[1:-1] -= np.diff(mean, 2) / 24.0
     return out
 

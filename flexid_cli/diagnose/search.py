@@ -200,12 +200,15 @@ class Search:
             self._norms[form.name] = some, np.asarray(norms)
         return np.maximum(np.interp(cycles, *self._norms[form.name]), 1e-300)
 
-    def refine(self, best: Candidate, now: Basis, near: float = REFINED) -> Candidate:
-        """Search along each shape parameter in turn, between the neighbours of the best point."""
+    def refine(self, best: Candidate, now: Basis, near: float = REFINED, reach: float = 1.0) -> Candidate:
+        """Search along each shape parameter in turn, between the neighbours of the best point.
+
+        ``reach`` is how far to look, in distances of the neighbours.
+        """
         shapes = self.shapes(best.form)
         if not shapes:
             return best
-        steps = [_step(s) for s in shapes]
+        steps = [reach * _step(s) for s in shapes]
         for _ in range(2 if len(shapes) > 1 else 1):
             for k, s in enumerate(shapes):
                 best = self._along(best, k, s, steps[k], now, near)

@@ -233,8 +233,8 @@ def _scanned(problem: Problem, fitter: Fitter) -> list[Problem]:
 def _with_torque_noise(problem: Problem) -> Problem:
     """The problem with the torque's noise as the record shows it: a current's noise is seldom white.
 
-    With the motor alone it is what no linear relation explains: what eq. (18) leaves hangs on a stiffness that is not
-    known yet, and the encoder's part hides it. Else it is what the motor equation leaves just above the band.
+    It is what no linear relation explains: what an equation leaves holds the effects that are looked for, too. With a
+    rigid baseline, or where that cannot be told, it is what the motor equation leaves just above the band.
     """
     s = max(problem.stretches, key=lambda s: s.torque.size)
     found = None

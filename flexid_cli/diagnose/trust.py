@@ -76,7 +76,7 @@ def _known_noise(problem: Problem, s: Stretch, noisy: Stretch) -> list[Complex |
 
 def _with_noise(s: Stretch, problem: Problem, rng: np.random.Generator) -> Stretch:
     joint = None
-    torque = problem.noise.torque * rng.standard_normal(s.torque.size)
+    torque = _facing(s.torque) * problem.noise.torque * rng.standard_normal(s.torque.size)
     motor = _encoder_noise(s.motor, s.motor_smooth, problem.noise.motor_position, rng)
     if problem.both:
         joint = s.joint + _encoder_noise(s.joint, s.joint_smooth, problem.noise.joint_position, rng)
@@ -91,11 +91,17 @@ def _encoder_noise(position: Array, smooth: Array, sigma: float, rng: np.random.
 
     About a standstill counts follow each other slowly, and their error is slow: white noise has too little of that.
     """
-    count = count_of(position, sigma)
+    count, facing = count_of(position, sigma), _facing(position)
     if count == 0.0:
-        return np.asarray(sigma * rng.standard_normal(position.size), dtype=np.float64)
-    passed = smooth + count * rng.random()
-    return np.asarray(count * np.round(passed / count) - passed, dtype=np.float64)
+        return np.asarray(facing * sigma * rng.standard_normal(position.size), dtype=np.float64)
+    passed = facing * smooth + count * rng.random()
+    return np.asarray(facing * (count * np.round(passed / count) - passed), dtype=np.float64)
+
+
+def _facing(x: Array) -> float:
+    """Side of its mean on which a signal goes farthest: an axis that counts the other way has the same physics."""
+    away = x - x.mean()
+    return float(np.sign(away[int(np.argmax(np.abs(away)))])) or 1.0
 
 
 def count_of(position: Array, sigma: float) -> float:

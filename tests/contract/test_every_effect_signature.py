@@ -35,6 +35,7 @@ SMALL: dict[tuple[str, int], tuple[tuple[float, ...], tuple[float, ...]]] = {
     ("viscous_nonlinear", 1): ((0.5,), (0.5,)),
     ("load_dependent_friction", 0): ((), (0.03,)),
     ("cogging", 0): ((20.0,), (0.3, -0.2)),
+    ("cogging", 1): ((15.0,), (0.2, -0.1, 0.15, 0.1)),
     ("torque_saturation", 0): ((12.0,), (1.0,)),
     ("actuator_lag", 0): ((2e-3,), (1.0,)),
     ("thermal_drift", 0): ((4.0,), (1.0,)),

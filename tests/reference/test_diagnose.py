@@ -186,7 +186,7 @@ def test_units_side_and_time_of_recording_change_nothing():
 def test_an_axis_that_counts_the_other_way_has_the_same_physics():
     config, recording = read(small()[0])
     turned = tuple(_turned(s) for s in recording.segments)
-    assert_same(diagnose(replace(recording, segments=turned), config), flipped=("MX", "phi"))
+    assert_same(diagnose(replace(recording, segments=turned), config), flipped=("MX", "phi", "phi2"))
 
 
 def _turned(s: Segment) -> Segment:

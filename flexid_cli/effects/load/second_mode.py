@@ -45,6 +45,9 @@ def _torque(w: Array, p: Array, x: Array, dx: Array, _g: Array) -> None:
         dx[1] = 0.0
 
 
+MOST_INERTIA = 1.1  # of the load's, which before the effect is found is that of both
+
+
 def _columns(m: Motion, shape: Sequence[float]) -> Terms:
     return Terms(load=column(resonant(m.joint_acceleration, shape[0], shape[1], m.period_s)))
 
@@ -52,8 +55,9 @@ def _columns(m: Motion, shape: Sequence[float]) -> Terms:
 def _shapes(scale: Scale) -> Sequence[Shape]:
     high = min(1.3 * scale.band_hz, 0.45 / scale.period_s)
     return (
-        Shape("frequency", 0.3 * scale.resonance_hz, high, 28),
-        Shape("damping_ratio", 0.01, 0.3, 2),
+        # A lightly damped mode between two frequencies is met by none of them unless the damping's points overlap.
+        Shape("frequency", 0.3 * scale.resonance_hz, high, 22),
+        Shape("damping_ratio", 0.01, 0.3, 3),
     )
 
 
@@ -66,6 +70,11 @@ def _values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
         "second_stiffness": stiffness,
         "second_damping": 2.0 * shape[1] * w * inertia,
     }
+
+
+def _tied(a: Array, _: Sequence[float], base: Base) -> str:
+    """A resonance far above the band is a curve that a negative load inertia and a larger second one make, too."""
+    return "the load would keep no inertia of its own" if float(a[0]) > MOST_INERTIA * base.JL else ""
 
 
 EFFECT = Effect(
@@ -84,5 +93,5 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.LOAD, _torque),),
     states=(EffectState("position", "joint_position"), EffectState("velocity", "joint_velocity")),
-    signatures=(Signature(_columns, _values, _shapes, sign=1),),
+    signatures=(Signature(_columns, _values, _shapes, sign=1, tied=_tied),),
 )
