@@ -22,7 +22,7 @@ ENOUGH = 0.12
 ENOUGH_ALONE = 0.25  # flexible, without a joint encoder: of the linear fit, whose columns are noisy
 ENOUGH_LED = 0.12  # of fits by simulation
 AS_GOOD = 0.05
-# Loss by which a simulation may be worse than the linear fit, which noise in its columns makes look better.
+# Gain that the linear fit may have over its simulation, for noise in its columns makes it look better than it is.
 NO_WORSE = 0.5
 WORTH_A_SIMULATION = 0.3  # loss that an alternative may be behind before it is simulated
 # Of several starts: those looked at with effects, how far behind they may be, and steps by simulation.
@@ -101,7 +101,7 @@ def _grown_led(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted
             if f.gain(fitted) > ENOUGH_ALONE and f.loss - trials[0].loss < WORTH_A_SIMULATION
         ]
         simulated = [s for f in trials if (s := _simulated(fitter, f))]
-        if not simulated and trials and not isinstance(fitted, LedFit):
+        if not simulated and trials and not fitted.chosen:
             simulated = trials[:1]
         new = min(simulated, key=lambda f: f.loss, default=None)
         if new is None or new.gain(fitted) < ENOUGH_LED:
@@ -116,7 +116,7 @@ def _simulated(fitter: Fitter, fitted: Fitted) -> Fitted | None:
     if _lawless(fitted):
         return fitted
     new = refined(fitter, fitted)
-    return None if new is None or new.loss - fitted.loss > NO_WORSE else new
+    return None if new is None or fitted.gain(new) > NO_WORSE else new
 
 
 def _lawless(fitted: Fitted) -> bool:
