@@ -119,12 +119,23 @@ class _Report:
         left = verdict.remainder(after.basis.rms, self.remaining, both=after.problem.both)
         self.verdict = verdict.decide(selection, left)
         # What does not explain the record is not named: the baseline stands, and the place of its mismatch.
-        named = self.verdict not in ("unexplained", "inconclusive")
-        self.final: Fitted = after if named else selection.before
+        self._take(
+            after if self.verdict not in ("unexplained", "inconclusive") else selection.before, validation
+        )
+        self.refuted = ""
+        if self.final.chosen and self._fails_elsewhere():
+            self.verdict = verdict.elsewhere(*self.unseen)
+            if self.verdict == "unexplained":
+                self.refuted = ", ".join(c.name for c in after.chosen)
+                self._take(selection.before, validation)
         self.maps = residual_maps(selection.before.problem, selection.before.basis)
+
+    def _take(self, final: Fitted, validation: Recording | None) -> None:
+        """Report this model, and what it leaves on data that it was not fitted to."""
+        self.final = final
         self.other = None
         if validation is not None:
-            self.other = first_problems(validation, config, fitter, self.final.problem)[0]
+            self.other = first_problems(validation, self.config, self.fitter, final.problem)[0]
         self.unseen = self._unseen()
 
     def diagnosis(self) -> Diagnosis:
@@ -295,6 +306,8 @@ class _Report:
         if self.verdict == "inconclusive":
             return "the record is too poor to judge"
         if name in {c.name for c in self.selection.after.chosen}:
+            if self.refuted:
+                return "what it explains here it does not explain on the other recording"
             if not self.selection.after.is_possible:
                 return "with it an inertia or the stiffness comes out negative"
             return "with it the model still leaves structure that it does not explain"
@@ -327,6 +340,8 @@ class _Report:
                 f"on the other recording {stays:.2g} times the noise floor stays: what was fitted here does not hold"
                 " there"
             )
+        if self.refuted:
+            notes.append(f"{self.refuted} would explain this recording, but not the other one")
         role = self.config.signals.torque_role
         if problem.shift > 0.0:
             notes.append(

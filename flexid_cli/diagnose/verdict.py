@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from flexid_cli.diagnose.location import Map
 from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.result import NamedEffect, Verdict
 from flexid_cli.diagnose.selection import Selection
 
+Array = NDArray[np.float64]
 Remainder = Literal["function", "size", ""]
 
 # Calibrated, see docs/diagnosis.md: gain of a free function of one variable that nothing explains by chance, and
@@ -18,6 +22,8 @@ UNEXPLAINED_GAIN = 0.25
 UNEXPLAINED_RMS = 4.0
 # Without a joint encoder the joint's motion is rebuilt, and its reversals are blurred.
 UNEXPLAINED_GAIN_ALONE, UNEXPLAINED_RMS_ALONE = 0.5, 4.0
+# Share of the mismatch on the other recording that named effects explain there.
+CARRIED_OVER = 0.8
 # A record whose torque stands less than this above its own noise cannot be judged.
 LEAST_SIGNAL = 10.0
 
@@ -77,6 +83,17 @@ def decide(selection: Selection, left: Remainder) -> Verdict:
     if left:
         return "partly_explained"
     return "ambiguous" if any(selection.alternatives) else "explained"
+
+
+def elsewhere(before: Array, after: Array) -> Verdict:
+    """Verdict of effects that leave more than a complete model does on the other recording.
+
+    Named are those that carry over all the same: of what the baseline leaves there above the noise (one a row) they
+    explain most.
+    """
+    above = float(before @ before) - before.size
+    explained = float(before @ before - after @ after) / max(above, 1e-300)
+    return "partly_explained" if explained > CARRIED_OVER else "unexplained"
 
 
 def sentence(

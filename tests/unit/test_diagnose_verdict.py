@@ -66,3 +66,9 @@ def test_a_part_that_stays_is_told_with_its_place():
     assert "cogging" in text
     assert "90 %" in text
     assert "in the load equation, as a function of position" in text
+
+
+def test_effects_that_explain_nothing_elsewhere_are_not_named():
+    before, little, most = (size * np.ones(100) for size in (9.0, 8.5, 4.1))
+    assert verdict.elsewhere(before, little) == "unexplained"
+    assert verdict.elsewhere(10.0 * before, most) == "partly_explained"
