@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from flexid_cli.diagnose.location import Map
-from flexid_cli.diagnose.verdict import UNEXPLAINED_GAIN, UNEXPLAINED_RMS, decide, remainder, sentence
+from flexid_cli.diagnose.verdict import (
+    UNEXPLAINED_GAIN,
+    UNEXPLAINED_RMS,
+    decide,
+    elsewhere,
+    remainder,
+    sentence,
+)
 
 
 def found(gain: float) -> Map:
@@ -70,5 +77,5 @@ def test_a_part_that_stays_is_told_with_its_place():
 
 def test_effects_that_explain_nothing_elsewhere_are_not_named():
     before, little, most = (size * np.ones(100) for size in (9.0, 8.5, 4.1))
-    assert verdict.elsewhere(before, little) == "unexplained"
-    assert verdict.elsewhere(10.0 * before, most) == "partly_explained"
+    assert elsewhere(before, little) == "unexplained"
+    assert elsewhere(10.0 * before, most) == "partly_explained"
