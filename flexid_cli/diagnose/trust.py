@@ -77,7 +77,9 @@ def _known_noise(problem: Problem, s: Stretch, noisy: Stretch) -> list[Complex |
 def _with_noise(s: Stretch, problem: Problem, rng: np.random.Generator) -> Stretch:
     joint = None
     torque = _facing(s.torque) * problem.noise.torque * rng.standard_normal(s.torque.size)
-    motor = _encoder_noise(s.motor, s.motor_smooth, problem.noise.motor_position, rng)
+    # With the motor alone no force tells what goes on within a count: a motion that stays in one has errors all the same.
+    counted = problem.both
+    motor = _encoder_noise(s.motor, s.motor_smooth, problem.noise.motor_position, rng, counted=counted)
     if problem.both:
         joint = s.joint + _encoder_noise(s.joint, s.joint_smooth, problem.noise.joint_position, rng)
     segment = replace(
@@ -86,12 +88,14 @@ def _with_noise(s: Stretch, problem: Problem, rng: np.random.Generator) -> Stret
     return s.like(segment)
 
 
-def _encoder_noise(position: Array, smooth: Array, sigma: float, rng: np.random.Generator) -> Array:
-    """One more draw of an encoder's noise; of counts, where they are all there is of it.
+def _encoder_noise(
+    position: Array, smooth: Array, sigma: float, rng: np.random.Generator, *, counted: bool = True
+) -> Array:
+    """One more draw of an encoder's noise; of counts, where they are all there is of it and ``counted``.
 
     About a standstill counts follow each other slowly, and their error is slow: white noise has too little of that.
     """
-    count, facing = count_of(position, sigma), _facing(position)
+    count, facing = count_of(position, sigma) if counted else 0.0, _facing(position)
     if count == 0.0:
         return np.asarray(facing * sigma * rng.standard_normal(position.size), dtype=np.float64)
     passed = facing * smooth + count * rng.random()
