@@ -77,7 +77,7 @@ def _known_noise(problem: Problem, s: Stretch, noisy: Stretch) -> list[Complex |
 def _with_noise(s: Stretch, problem: Problem, rng: np.random.Generator) -> Stretch:
     joint = None
     torque = _facing(s.torque) * problem.noise.torque * rng.standard_normal(s.torque.size)
-    # With the motor alone no force tells what goes on within a count: a motion that stays in one has errors all the same.
+    # With the motor alone no force tells what goes on within a count: a motion that stays in one errs all the same.
     counted = problem.both
     motor = _encoder_noise(s.motor, s.motor_smooth, problem.noise.motor_position, rng, counted=counted)
     if problem.both:
