@@ -365,8 +365,7 @@ def _with_suggestion(text: str, place: Where | None, verdict: Verdict) -> str:
     """The sentence, with what the place of something unknown suggests."""
     if verdict != "unexplained" or place is None or not place.suggests:
         return text
-    first = place.suggests[0]
-    return f"{text} {first[0].upper()}{first[1:]}."
+    return f"{text} What it looks like: {place.suggests[0]}."
 
 
 def _variable(equation: str, maps: list[Map]) -> str:

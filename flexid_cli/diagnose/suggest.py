@@ -147,9 +147,9 @@ def _loop(found: Locality) -> Iterator[str]:
 
 def _shape(where: Where) -> Iterator[str]:
     if where.variable in FACTORS:
-        yield f"it looks like {FACTORS[where.variable]}"
+        yield FACTORS[where.variable]
     if where.variable == "frequency" and where.frequency_hz is not None:
-        yield f"it is a tone of {where.frequency_hz[0]:.4g} Hz, whatever the axis does"
+        yield f"a tone of {where.frequency_hz[0]:.4g} Hz, whatever the axis does"
     if where.shape is None:
         return
     x, y = where.shape.x, where.shape.y
