@@ -222,13 +222,17 @@ def _outcome(plain: Solution, config: Config, tuning: band.Tuning) -> band_choic
         solution = methods.subtracted(solution)
     uncertainty = summary.total_uncertainty(solution, config)
     strong = [symbols.index(s) for s in ("Jm", "K", "JL")]
-    total, random = (np.diag(c)[strong] for c in (uncertainty.covariance, uncertainty.random))
-    noise = sum(s[strong] ** 2 for n, s in uncertainty.shifts.items() if n in summary.NOISES)
+    noise, systematic = np.zeros(3), np.zeros(3)
+    for name, shift in uncertainty.shifts.items():
+        if name in summary.NOISES:
+            noise += shift[strong] ** 2
+        elif name != summary.GEAR_DOUBT:  # there or not: a band that hides it is none the better
+            systematic += shift[strong] ** 2
     return band_choice.Outcome(
         solution.result.theta[strong],
-        np.sqrt(random),
+        np.sqrt(np.diag(uncertainty.random)[strong]),
         np.sqrt(noise),
-        np.sqrt(np.maximum(total - random - noise, 0.0)),
+        np.sqrt(systematic),
         float(np.min(solution.result.degrees_of_freedom[strong])),
     )
 

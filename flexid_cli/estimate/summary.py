@@ -39,6 +39,7 @@ SUMS = (
 )
 # Sources of systematic errors that are noise in the columns: what is subtracted, or all of it.
 NOISES = ("doubt about the noise in the columns", "encoder and torque noise in the columns")
+GEAR_DOUBT = "a doubt about the gear ratio"
 CLEAR_GEAR_SIGMA = 5.0
 # A ratio of tooth numbers is off by one tooth or not at all: by a thousandth for a ratio of a thousand.
 SMALLEST_GEAR_ERROR = 1e-3
@@ -219,7 +220,7 @@ def total_uncertainty(solution: Solution, config: Config, misfit: float = 1.0) -
             shifts["flexibility, which the rigid model leaves out"] = flexibility.shift(at_most=0.0)
     gear = _clear_gear_error(solution)
     if gear is not None:
-        shifts["a doubt about the gear ratio"] = gear.shift(at_most=0.0)
+        shifts[GEAR_DOUBT] = gear.shift(at_most=0.0)
     # An output-error fit has its own random part; what systematic sources do to it is taken from its start.
     random_part = misfit * solution.reported.covariance
     covariance = random_part + sum(np.outer(s, s) for s in shifts.values())
