@@ -78,14 +78,22 @@ def select(fitter: Fitter, problems: Sequence[Problem]) -> Selection:
 
 def _grown(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
     """The model with the effects that the record holds."""
-    enough = threshold(fitted.problem)
+    enough, seen = threshold(fitted.problem), {_names(fitted)}
     while len(fitted.chosen) < MOST_EFFECTS:
         trials = _added(fitter, fitted, found)
         if not trials or trials[0].gain(fitted) < enough:
             break
-        fitted = fitter.reweighted(_needed(fitter, trials[0], enough))
+        grown = fitter.reweighted(_needed(fitter, trials[0], enough))
+        if _names(grown) in seen:  # rows are weighted anew by each set of effects: it could go round for ever
+            break
+        fitted = grown
+        seen.add(_names(fitted))
         found = fitter.candidates(fitted)
     return fitted
+
+
+def _names(fitted: Fitted) -> frozenset[str]:
+    return frozenset(c.name for c in fitted.chosen)
 
 
 def _grown_led(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
@@ -93,6 +101,7 @@ def _grown_led(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted
 
     A model at a wrong stiffness, and an effect that only stands in for another, are denied by it.
     """
+    seen = {_names(fitted)}
     while len(fitted.chosen) < MOST_EFFECTS:
         trials = _added(fitter, fitted, found)
         trials = [
@@ -106,7 +115,11 @@ def _grown_led(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted
         new = min(simulated, key=lambda f: f.loss, default=None)
         if new is None or new.gain(fitted) < ENOUGH_LED:
             break
-        fitted = _confirmed(fitter, new) if len(new.chosen) > 1 else new
+        grown = _confirmed(fitter, new) if len(new.chosen) > 1 else new
+        if _names(grown) in seen:
+            break
+        fitted = grown
+        seen.add(_names(fitted))
         found = fitter.candidates(fitted)
     return fitted
 
