@@ -714,9 +714,14 @@ def _reversal_step(velocities: Sequence[Array], rate_hz: float, cutoff_hz: float
 def _without_errors(s: Stretch, applied: Mapping[Form, Array]) -> Stretch:
     """The stretch with the joint's position as it was before errors of measurement."""
     joint = s.joint
+
+    def banded(x: Array, order: int) -> Array:
+        """Derivative without noise above the band, which a skew of some samples would lift a hundred times."""
+        return s.derivative(s.lowpass(x, JOINT_SIGN_BAND), order)
+
     for form, amplitudes in applied.items():
         if form.signature.corrected is not None:
-            joint = form.signature.corrected(joint, amplitudes, s.derivative)
+            joint = form.signature.corrected(joint, amplitudes, banded)
     return s if joint is s.joint else s.with_joint(joint)
 
 
