@@ -47,6 +47,8 @@ _HEAD = 1 << 18
 # Bytes of a file that are worth threads, and the start of compiled code.
 _THREADED = 1 << 24
 _COMPILED = 1 << 27
+# Bytes that pandas parses at once, for it takes a millisecond or two to begin; compiled code takes half of them.
+_BLOCK = 1 << 20
 _SPLICE = 1 << 16  # samples converted in place at once
 # Damage leaves most lines whole. Where more than this share of them does not fit, the table is not written
 # as it seems to be, and what does fit may be read wrong.
@@ -69,17 +71,18 @@ class CsvReader:
 
     def __init__(self, options: Options | None = None) -> None:
         self.options: Options = options or Detect()
+        self._sniffed: dict[Path, _Table] = {}
 
     def sniff(self, path: Path, head: bytes) -> bool:
         """Whether ``path`` is a text with rows of numbers."""
         if not head or path.is_dir():
             return False
         try:
-            lines, _ = _first_lines(_head(path), self.options, path)
-            dialect = detect(lines, self.options, name=str(path))
+            table = _Table(path, self.options)
         except InputError:
             return False
-        return _is_table(lines, dialect)
+        self._sniffed[path] = table
+        return _is_table(table.lines, table.dialect)
 
     def columns(self, paths: Sequence[Path]) -> list[str]:
         """List the names of the columns that hold numbers, by the first lines only.
@@ -154,7 +157,9 @@ class CsvReader:
         return RawLog(self.name, tuple(paths), read, damage=tuple(damage), lost_rows=lost)
 
     def _open(self, paths: Sequence[Path]) -> list[_Table]:
-        tables = [_Table(path, self.options) for path in paths]
+        tables = [
+            self._sniffed.pop(path) if path in self._sniffed else _Table(path, self.options) for path in paths
+        ]
         first = tables[0]
         for table in tables[1:]:
             if [one.text for one in table.dialect.fields] != [one.text for one in first.dialect.fields]:
@@ -330,8 +335,8 @@ class _Table:
         head = _head(path)
         if not head:
             raise InputError(f"{path} is empty", "check that the log was written")
-        lines, self._encoding = _first_lines(head, options, path)
-        self.dialect: Dialect = detect(lines, options, name=str(path))
+        self.lines, self._encoding = _first_lines(head, options, path)
+        self.dialect: Dialect = detect(self.lines, options, name=str(path))
         self._line_bytes = len(head) / max(1, head.count(b"\n"))
         self._returns = b"\r" in head
         self._raw = is_like_ascii(self._encoding)
@@ -405,7 +410,7 @@ class _Table:
 
     def _blocks(self, advance: Callable[[int], None]) -> Iterator[Block | Fault]:
         """Cut the text below the header into blocks of whole lines."""
-        cutter = Cutter(self.dialect)
+        cutter = Cutter(self.dialect, _BLOCK // 2 if _size(self.path) >= _COMPILED else _BLOCK)
         for piece in unified(pieces(self.path, advance), self._encoding, returns=self._returns):
             yield from cutter.fault(piece) if isinstance(piece, Fault) else cutter.feed(piece)
         yield from cutter.end()

@@ -13,7 +13,6 @@ from flexid_cli.readers.dialect import Dialect, is_whole, split_line
 from flexid_cli.readers.packed import Fault
 
 T = TypeVar("T")
-_BLOCK = 1 << 19  # bytes of text parsed at once
 _CHECKED = 1 << 16  # bytes that are worth a block of their own
 _LONGEST_LINE = 1 << 20
 _TAIL = 1 << 12  # bytes of the last lines, to judge the very last by
@@ -70,11 +69,13 @@ def unified(found: Iterator[bytes | Fault], encoding: str, *, returns: bool) -> 
 class Cutter:
     """Cuts a text below its header into blocks of whole lines.
 
-    A block ends where a checksum confirms what came before, for doubts go back to the start of a block.
+    A block has at least ``block`` bytes, or ends where a checksum confirms what came before, for doubts go back to
+    the start of a block.
     """
 
-    def __init__(self, dialect: Dialect) -> None:
+    def __init__(self, dialect: Dialect, block: int) -> None:
         self._dialect = dialect
+        self._block = block
         self._parts: list[bytes] = []
         self._size = 0
         self._done = 0
@@ -86,7 +87,7 @@ class Cutter:
         """Take the next text; yield a block where there is enough of it."""
         self._parts.append(text)
         self._size += len(text)
-        enough = _BLOCK if text else _CHECKED
+        enough = self._block if text else _CHECKED
         if self._size >= enough or self._skip:
             yield from self._whole_lines()
 

@@ -204,7 +204,7 @@ def test_only_the_damaged_part_of_a_packed_file_is_suspect(tmp_path: Path) -> No
     packed[1][-7] ^= 4
     path = save(tmp_path, b"".join(packed))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("flexid_cli.readers.lines._BLOCK", 1)
+        patch.setattr("flexid_cli.readers.csv._BLOCK", 1)
         log = read(path)
         assert_rows(log, rows[:10] + rows[20:])
         assert (log.damage[0].trusted, log.damage[0].suspect) == (20, 10)
@@ -395,7 +395,7 @@ def test_files_with_other_columns_are_not_one_recording(tmp_path: Path) -> None:
 
 
 def test_a_long_file_crosses_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexid_cli.readers.lines._BLOCK", 500)
+    monkeypatch.setattr("flexid_cli.readers.csv._BLOCK", 500)
     monkeypatch.setattr("flexid_cli.readers.packed._BLOCK", 64)
     rows = [(k / 1000, float(k % 7), -k / 3) for k in range(500)]
     assert_rows(read(save(tmp_path, text(rows=rows, end="\r\n"))), rows)
@@ -439,7 +439,7 @@ def test_a_hole_of_zeros(tmp_path: Path) -> None:
 
 
 def test_a_stretch_without_line_ends_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexid_cli.readers.lines._BLOCK", 4096)
+    monkeypatch.setattr("flexid_cli.readers.csv._BLOCK", 4096)
     monkeypatch.setattr("flexid_cli.readers.packed._BLOCK", 4096)
     monkeypatch.setattr("flexid_cli.readers.lines._LONGEST_LINE", 20_000)
     rows = [(k / 1000, float(k % 7), -k / 3) for k in range(2000)]
@@ -466,7 +466,7 @@ def test_many_bad_lines_mean_another_kind_of_table(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_threads_and_progress(threads: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flexid_cli.readers.lines._BLOCK", 4096)
+    monkeypatch.setattr("flexid_cli.readers.csv._BLOCK", 4096)
     monkeypatch.setattr("flexid_cli.readers.packed._BLOCK", 4096)
     rows = [(k / 1000, float(k % 7), -k / 3) for k in range(5000)]
     path = save(tmp_path, text(rows=rows))
