@@ -3,6 +3,9 @@
     python benchmarks/coverage.py --records 200 --jobs 2 --results coverage.jsonl
     python benchmarks/coverage.py --results coverage.jsonl --markdown docs/coverage.md
 
+The table stands beside the page as CSV, too. Where only some cells are measured anew, theirs replace those that stand
+there, and the others stay (``--cells '*/motor_only/*' --markdown docs/coverage.md`` with results of these cells).
+
 Every record is simulated by ``benchmarks/machine``, which shares no code with flexid, and goes through the same
 steps as a log: stamps, units, filters, estimate. One JSON line a record is appended to the results, and a record that
 stands there already is not made again. A cell is one of
@@ -20,6 +23,7 @@ first order, with its corner at a quarter of the resonance. The controller, the 
 from __future__ import annotations
 
 import argparse
+import csv
 import fnmatch
 import json
 import math
@@ -28,8 +32,8 @@ import os
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -370,6 +374,35 @@ def _row(cell: str, route: str, symbol: str, truth: float, outcomes: Sequence[di
     )  # fmt: skip
 
 
+def merged(rows: Sequence[Row], path: Path) -> list[Row]:
+    """The rows, and those that a table of CSV holds of other cells."""
+    fresh = {r.cell for r in rows}
+    kept = []
+    if path.exists():
+        with path.open(encoding="utf-8", newline="") as file:
+            for line in csv.DictReader(file):
+                typed = {f.name: _TYPES[str(f.type)](line[f.name]) for f in fields(Row)}
+                kept.append(Row(**typed))
+    return sorted(
+        [*rows, *(r for r in kept if r.cell not in fresh)],
+        key=lambda r: (r.cell, ROUTES.index(r.route), SYMBOLS.index(r.symbol)),
+    )
+
+
+_TYPES: dict[str, Callable[[str], Any]] = {"str": str, "int": int, "float": float}
+
+
+def keep(rows: Sequence[Row], path: Path) -> None:
+    """Write the rows of the judged parameters as CSV."""
+    names = [f.name for f in fields(Row)]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(names)
+        for row in rows:
+            values = [getattr(row, name) for name in names]
+            writer.writerow([format(v, ".6g") if isinstance(v, float) else v for v in values])
+
+
 def holm(p_values: Sequence[float]) -> list[float]:
     """Holm's adjusted p values, in the given order."""
     order = np.argsort(p_values)
@@ -427,7 +460,8 @@ def markdown(rows: Sequence[Row], found: Sequence[tuple[str, bool, str]], record
         "",
         "Bias and spread are median and scaled median deviation of the estimates' errors, `claimed` is the median",
         "standard error, all in per cent of the truth; coverage is the share of the 95 % intervals that hold the",
-        "truth, among the records in which the parameter's verdict is `identified`.",
+        "truth, among the records in which the parameter's verdict is `identified`. The rows stand in",
+        "`coverage.csv`, too, where cells that are measured anew replace theirs (docs/method.md says which were).",
         "",
         "## Targets",
         "",
@@ -470,6 +504,14 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     left.legend(loc="upper left")
     figure.savefig(path, format="svg", metadata={"Date": None})
     plt.close(figure)
+
+
+def publish(rows: Sequence[Row], found: Sequence[tuple[str, bool, str]], page: Path) -> None:
+    """Write the page, its figure and the table beside it."""
+    keep([r for r in rows if r.symbol in JUDGED], page.with_suffix(".csv"))
+    draw(rows, page.with_suffix(".svg"))
+    text = markdown(rows, found, min(r.records for r in rows), page.with_suffix(".svg").name)
+    page.write_text(text, encoding="utf-8")
 
 
 def targets(rows: Sequence[Row]) -> list[tuple[str, bool, str]]:
@@ -532,16 +574,15 @@ def main() -> int:
         run_all(arguments.cells, arguments.records, arguments.results, arguments.jobs)
     lines = [x for x in read(arguments.results) if fnmatch.fnmatch(x["cell"], arguments.cells)]
     rows = table(lines)
+    if arguments.markdown:
+        rows = merged(rows, arguments.markdown.with_suffix(".csv"))
     print(show(rows, arguments.route, arguments.symbols.split(",")))
     print(f"median time of one identification {np.median([x['seconds'] for x in lines]):.2f} s")
     found = targets(rows)
     for name, ok, number in found:
         print(f"{'met   ' if ok else 'MISSED'} {name}: {number}")
     if arguments.markdown:
-        figure = arguments.markdown.with_suffix(".svg")
-        draw(rows, figure)
-        fewest = min(r.records for r in rows)
-        arguments.markdown.write_text(markdown(rows, found, fewest, figure.name), encoding="utf-8")
+        publish(rows, found, arguments.markdown)
     return 0 if all(ok for _, ok, _ in found) else 1
 
 

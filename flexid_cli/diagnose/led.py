@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import Basis
 from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter
-from flexid_cli.diagnose.problem import ALONE_NAMES, MOTOR_SIGN_BAND, Problem, later
+from flexid_cli.diagnose.problem import ALONE_NAMES, MOTOR_SIGN_BAND, Problem, Stretch, later
+from flexid_cli.diagnose.reversals import motor_sharpened
 from flexid_cli.diagnose.rows import Complex
+from flexid_cli.diagnose.trust import trusted
 from flexid_cli.effects.base import EffectValues, Stage
-from flexid_cli.effects.motion import Base
+from flexid_cli.effects.motion import Base, Motion
 from flexid_cli.errors import FlexidError
 from flexid_cli.pipeline.columns import reversal
 from flexid_cli.simulate.machine import Trajectory
@@ -129,6 +131,15 @@ def residual(problem: Problem, point: Point) -> Array | None:
 
 def _simulated(problem: Problem, point: Point) -> list[Trajectory] | None:
     """What the axis does behind the measured motor, and the torque that this takes, by stretch."""
+    runs = _led(problem, point)
+    if runs is None:
+        return None
+    each = zip(problem.stretches, problem.motions, runs, strict=True)
+    return [_reversed(s, m, point, run) for s, m, run in each]
+
+
+def _led(problem: Problem, point: Point) -> list[Trajectory] | None:
+    """The same with the motor's velocity as its position shows it."""
     from flexid_cli.simulate.engine import simulate_motor_driven
     from flexid_cli.simulate.machine import Axis, InitialState, Solver
 
@@ -156,6 +167,43 @@ def _simulated(problem: Problem, point: Point) -> list[Trajectory] | None:
         return None
 
 
+def _reversed(s: Stretch, m: Motion, point: Point, run: Trajectory) -> Trajectory:
+    """The simulation with the motor's friction by the sharper velocity, about its reversals."""
+    if s.sharpener is None:
+        return run
+    b = point.base
+    sharp = replace(m, base=b, motor_velocity=s.motor_sharp, motor_sign=s.motor_sign(b.motor_reversal))
+    plain = replace(
+        m,
+        base=b,
+        motor_velocity=run.motor_velocity,
+        motor_sign=reversal(run.motor_velocity, b.motor_reversal),
+    )
+    torque = run.torque + b.FSm * (sharp.motor_sign - plain.motor_sign)
+    for c, a in zip(point.chosen, point.amplitudes, strict=True):
+        if _is_signal(c):
+            continue
+        there, here = (c.form.signature.columns(x, c.shape).motor for x in (sharp, plain))
+        if there is not None and here is not None:
+            torque = torque + (there - here) @ a
+    return replace(run, torque=torque)
+
+
+def _informed(problem: Problem, fitted: Fitted, point: Point) -> Problem:
+    """The record with reversals and weights of rows that know of a model and of where it leads the load."""
+    runs = _led(problem, point)
+    if runs is None:
+        return problem
+    b = point.base
+    friction = fitted.at_reversal("FSm", b.motor_reversal)
+    held = []
+    for s, m, run in zip(problem.stretches, problem.motions, runs, strict=True):
+        v = run.motor_velocity
+        own = b.Jm * run.motor_acceleration + b.FVm * v + friction * reversal(v, b.motor_reversal)
+        held.append(own + b.K * run.true_motor_position - run.torque - _lost(s, m, point))
+    return trusted(motor_sharpened(problem.at(b), held, friction))
+
+
 def _paths(problem: Problem, point: Point) -> list[Array]:
     """The motor's motion, without what effects of measurement make of it."""
     out = []
@@ -172,14 +220,20 @@ def _rows(problem: Problem, point: Point, runs: Sequence[Trajectory]) -> Array |
     """Rows of recorded less simulated torque."""
     parts = []
     for s, m, run in zip(problem.stretches, problem.motions, runs, strict=True):
-        torque = s.torque
-        for c, a in zip(point.chosen, point.amplitudes, strict=True):
-            lost = c.form.signature.columns(m, c.shape).motor if _is_signal(c) else None
-            torque = torque if lost is None else torque - lost @ a
+        torque = s.torque - _lost(s, m, point)
         recorded = later(s, s.spectrum(problem.through(s, torque)), problem.shift)
         parts.append(recorded - s.spectrum(problem.through(s, run.torque)))
     e = _weighted(problem, parts)[:, 0]
     return e if np.all(np.isfinite(e)) else None
+
+
+def _lost(s: Stretch, m: Motion, point: Point) -> Array:
+    """Torque that effects of measurement add to the recorded one."""
+    lost = np.zeros(s.torque.size)
+    for c, a in zip(point.chosen, point.amplitudes, strict=True):
+        added = c.form.signature.columns(m, c.shape).motor if _is_signal(c) else None
+        lost = lost if added is None else lost + added @ a
+    return lost
 
 
 def _weighted(problem: Problem, parts: Sequence[Complex]) -> Array:
@@ -192,7 +246,8 @@ def _motor_columns(problem: Problem, point: Point, runs: Sequence[Trajectory]) -
     width, parts = point.base.motor_reversal, []
     for s, run in zip(problem.stretches, runs, strict=True):
         v = run.motor_velocity
-        columns = (run.motor_acceleration, v, reversal(v, width))
+        sign = reversal(v, width) if s.sharpener is None else s.motor_sign(width)
+        columns = (run.motor_acceleration, v, sign)
         parts.append(s.spectrum(np.column_stack([problem.through(s, x) for x in columns])))
     return _weighted(problem, parts)
 
@@ -206,12 +261,18 @@ class LedFit(Fitted):
 
 @dataclass(frozen=True)
 class _Limits:
+    """Range of each element of the vector, and the longest step."""
+
     low: Array
     high: Array
+    most: Array
 
     @classmethod
     def of(cls, fitted: Fitted, x: Array) -> _Limits:
-        low, high = np.full(x.size, -np.inf), np.full(x.size, np.inf)
+        low, high, most = np.full(x.size, -np.inf), np.full(x.size, np.inf), np.full(x.size, np.inf)
+        # The rows hardly feel how the load starts: noise would throw it anywhere.
+        own = _start_steps(fitted.problem) / FIRST_DIFFERENCE
+        most[-2 - own.size : -2] = MOST_CHANGE * own
         for k, n in enumerate(ALONE_NAMES):
             low[k] = 0.0 if n in FRICTION else 0.05 * x[k]
         i = len(ALONE_NAMES)
@@ -225,7 +286,7 @@ class _Limits:
                 low[i], high[i] = shape.low, shape.high
                 i += 1
         low[-2:] = np.log(1e-6)
-        return cls(np.minimum(low, x), np.maximum(high, x))
+        return cls(np.minimum(low, x), np.maximum(high, x), most)
 
 
 def predicted(problem: Problem, fitted: LedFit) -> Array | None:
@@ -235,6 +296,7 @@ def predicted(problem: Problem, fitted: LedFit) -> Array | None:
     """
     here = problem.at(fitted.problem.base, shift=fitted.problem.shift)
     point, steps = replace(fitted.point, starts=starts(here)), _start_steps(here)
+    here = _informed(here, fitted, point)
     e = residual(here, point)
     for _ in range(START_STEPS):
         if e is None:
@@ -257,11 +319,12 @@ def refined(fitter: Fitter, fitted: Fitted, most: int = STEPS) -> LedFit | None:
 
     Its columns are the simulation's derivatives.
     """
-    problem, start = fitted.problem, Point.of(fitted)
-    x = start.vector()
+    start = Point.of(fitted)
+    problem, x = _informed(fitted.problem, fitted, start), start.vector()
     limits = _Limits.of(fitted, x)
     damping, widths = DAMPING, _first_steps(problem, x)
     jumps = MOST_JUMPS if most == STEPS else 0
+    kept, least = x, np.inf  # a jump may lead astray
     for _ in range(most + jumps):
         found = _derivatives(problem, start, x, widths)
         if found is None:
@@ -273,6 +336,8 @@ def refined(fitter: Fitter, fitted: Fitted, most: int = STEPS) -> LedFit | None:
         if moved is not None:
             x, e_new, damping = moved
             change, e = float(np.log((e @ e) / (e_new @ e_new))), e_new
+        if e @ e < least:
+            kept, least = x, float(e @ e)
         if change < SETTLED:
             jumped = (
                 _jumped(problem, start, x, e, J, limits) if jumps and e @ e > ABOVE_NOISE * e.size else None
@@ -280,7 +345,7 @@ def refined(fitter: Fitter, fitted: Fitted, most: int = STEPS) -> LedFit | None:
             if jumped is None:
                 break
             x, damping, jumps = jumped, DAMPING, jumps - 1
-    return _as_fitted(fitter, fitted, start, x, widths, J if most < STEPS else None)
+    return _as_fitted(fitter, problem, start, kept, widths, J if most < STEPS else None)
 
 
 def _first_steps(problem: Problem, x: Array) -> Array:
@@ -403,7 +468,7 @@ def _step(x: Array, e: Array, J: Array, damping: float, limits: _Limits) -> Arra
         moved[beyond] = np.clip(moved, limits.low, limits.high)[beyond]
         target = target - J[:, beyond] @ (moved - x)[beyond]
         free = free & ~beyond
-    most = np.full(x.size, np.inf)
+    most = limits.most.copy()
     for k, n in enumerate(ALONE_NAMES):
         if n not in FRICTION:
             most[k] = MOST_CHANGE * abs(x[k])
@@ -412,14 +477,14 @@ def _step(x: Array, e: Array, J: Array, damping: float, limits: _Limits) -> Arra
 
 
 def _as_fitted(
-    fitter: Fitter, fitted: Fitted, start: Point, x: Array, steps: Array, rough: Array | None
+    fitter: Fitter, problem: Problem, start: Point, x: Array, steps: Array, rough: Array | None
 ) -> LedFit | None:
     """The solution as a fit that is linear about it, its rows weighted by what it found.
 
     With ``rough`` derivatives those of another point stand for its own.
     """
     point = start.at(x)
-    problem = fitted.problem.at(point.base)
+    problem = problem.at(point.base)
     if rough is None:
         found = _derivatives(problem, start, x, steps)
     else:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Numbers = TypeVar("Numbers", Array, Complex)
 Part = Callable[["Stretch", Motion], Sequence["Complex | None"]]
-Sharpener = Callable[[Segment, float], tuple[Array, Array]]
+Sharpener = Callable[[Segment, float], Sequence[Array]]
 Effects = Sequence[tuple[Callable[[Motion], Terms], Array]]  # columns of effects and their amplitudes
 
 HALF_WIDTH = 12  # of the derivatives: exact to 1e-6 up to a third of the sampling rate
@@ -92,17 +92,21 @@ class Stretch:
         if self.joint.size:
             self.joint_smooth = self.lowpass(self.joint, SMOOTH_BAND)
         if sharpener is not None:
-            fine = sharpener(segment, rate_hz)
-            (self.motor_sharp, self.joint_sharp), (self.motor_fine, self.joint_fine) = (
-                [v[::FINE] for v in fine],
-                fine,
-            )
+            self.motor_fine, *joint = sharpener(segment, rate_hz)
+            self.motor_sharp = self.motor_fine[::FINE]
+            for fine in joint:
+                self.joint_fine, self.joint_sharp = fine, fine[::FINE]
             return
         self.motor_sharp = self.derivative(self.lowpass(self.motor, MOTOR_SIGN_BAND), 1)
         self.motor_fine = between(self.motor_sharp)
         if self.joint.size:
             self.joint_sharp = self.derivative(self.lowpass(self.joint, JOINT_SIGN_BAND), 1)
             self.joint_fine = between(self.joint_sharp)
+
+    def motor_sign(self, width: float) -> Array:
+        """Sign of the motor's velocity without a joint encoder, shape (n,)."""
+        sharpened = self.sharpener is not None
+        return mean_sign(self.motor_fine, width) if sharpened else reversal(self.motor_sharp, width)
 
     def like(self, segment: Segment) -> Stretch:
         """The same stretch with other signals."""
@@ -358,13 +362,13 @@ class Problem:
             motor_sign = mean_sign(s.motor_fine, base.motor_reversal)
             joint_sign = mean_sign(s.joint_fine, base.load_reversal)
         else:
-            motor_sign = reversal(s.motor_sharp, base.motor_reversal)
+            motor_sign = s.motor_sign(base.motor_reversal)
             friction = base.FVm * s.motor_velocity + base.FSm * s.lowpass(motor_sign, SMOOTH_BAND)
             inertial = base.Jm * s.motor_acceleration
             joint = s.motor_smooth - (s.torque_smooth - inertial - friction) / base.K
             joint = s.lowpass(joint, SMOOTH_BAND)
             velocity, acceleration = s.derivative(joint, 1), s.derivative(joint, 2)
-            sharp = s.derivative(self._led(s), 1) if self.led else velocity
+            sharp = s.derivative(self.led_position(s), 1) if self.led else velocity
             joint_sign = reversal(sharp, base.load_reversal)
         return Motion(
             time_s=s.time_s,
@@ -386,7 +390,7 @@ class Problem:
             duration_s=self.duration_s,
         )
 
-    def _led(self, s: Stretch) -> Array:
+    def led_position(self, s: Stretch) -> Array:
         """Where the load goes when the motor moves as measured: no noise of the torque is in it, and no effect."""
         b = self.base
         return follow(b.K * s.motor, b.JL, max(b.FV, 0.0), b.K, max(b.FS, 0.0), b.load_reversal, s.period_s)
@@ -497,7 +501,7 @@ class Problem:
                 sign = mean_sign(s.motor_fine if motor else s.joint_fine, width)
                 return self._one(s.spectrum(sign), "motor" if motor else "load")
             if motor:
-                return [s.spectrum(self.through(s, reversal(s.motor_sharp, width)))]
+                return [s.spectrum(self.through(s, s.motor_sign(width)))]
             return [s.spectrum(reversal(m.joint_velocity, width))]
 
         return self._rows(part)[:, 0]

@@ -1,10 +1,12 @@
-"""Velocities about their reversals, from an encoder and the forces on its side together (both encoders).
+"""Velocities about their reversals, from an encoder and the forces on its side together.
 
 A reversal is sharper than any band in which an encoder's derivative is clean, and what is wrong about the sign of the
 velocity there stands in the equation with all of the Coulomb friction. The forces know better: torque, spring and
 friction give the acceleration, whose integral is good at high frequency, as the encoder is at low. An extended Kalman
 smoother (Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445) of one side's equation joins the two. How far the equation
 can be trusted (what it lacks acts as noise) is chosen by the likelihood of the encoder's values.
+
+Without a joint encoder the other end of the spring is where a load goes that the measured motor leads.
 """
 
 from __future__ import annotations
@@ -100,6 +102,59 @@ class Reversals:
             joint,
             stiffness * (motor - self.zero),
         )
+
+
+@dataclass(frozen=True)
+class MotorReversals:
+    """Smoother of the motor's velocity in one stretch, where the motor has the only encoder.
+
+    Attributes
+    ----------
+    motor : Side
+    held : ndarray, shape (n,)
+        Torque on the motor from what it does not carry itself: from the other end of the spring, and effects.
+    """
+
+    motor: Side
+    held: Array
+
+    def __call__(self, segment: Segment, rate_hz: float) -> tuple[Array]:
+        """The motor's velocity, `FINE` steps a period."""
+        return (self.motor.smoothed(segment.motor_position, segment.torque + self.held, 1.0 / rate_hz)[1],)
+
+    def doubted(self, segment: Segment, rate_hz: float) -> MotorReversals:
+        """The same with as much noise of the equation as the encoder's values ask for."""
+        force = segment.torque + self.held
+        return replace(self, motor=self.motor.doubted(segment.motor_position, force, 1.0 / rate_hz))
+
+
+def motor_sharpened(
+    problem: Problem, held: Sequence[Array] | None = None, friction: float | None = None
+) -> Problem:
+    """The problem of the motor alone with reversals told by its encoder and the forces together.
+
+    Parameters
+    ----------
+    problem : Problem
+    held : sequence of ndarray, optional
+        As in `MotorReversals`, by stretch; the baseline's unless given.
+    friction : float, optional
+        All friction that turns its sign at a reversal of the motor; the baseline's unless given.
+    """
+    b, noise = problem.base, problem.noise
+    if problem.both or problem.rigid or noise.motor_position == 0.0:
+        return problem
+    if held is None:
+        held = [b.K * problem.led_position(s) for s in problem.stretches]
+    rate = problem.stretches[0].rate_hz
+    size = float(np.sqrt(noise.torque**2 + problem.floor(rate)))
+    total = b.FSm if friction is None else friction
+    side = Side(b.Jm, b.FVm, b.K, total, b.motor_reversal, 0.0, noise.motor_position, size)
+    stretches = [
+        s.sharpened(MotorReversals(side, torque).doubted(s.segment, rate))
+        for s, torque in zip(problem.recorded, held, strict=True)
+    ]
+    return problem.at(b, stretches=stretches)
 
 
 def sharpened(problem: Problem, effects: Effects = (), friction: Sequence[float] | None = None) -> Problem:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flexid_cli.diagnose.basis import solve
 from flexid_cli.diagnose.fitter import Chosen, Fitter, informed
 from flexid_cli.diagnose.problem import SHORTEST_S, SMOOTH_BAND, Problem, Stretch
+from flexid_cli.diagnose.reversals import motor_sharpened
 from flexid_cli.diagnose.rows import motor_only_noise, two_encoder_noise
 from flexid_cli.diagnose.torque_noise import ABOVE, HIGHEST, MOST_FALL, torque_noise
 from flexid_cli.diagnose.trust import trusted
@@ -100,7 +101,7 @@ def first_problems(
     problems = _scanned(problem, fitter) if known is None else [problem.at(known)]
     for one in problems:
         one.anchor, one.settled = one.base, known is not None
-    return [trusted(_with_torque_noise(one)) for one in problems]
+    return [trusted(motor_sharpened(_with_torque_noise(one))) for one in problems]
 
 
 def _both_base(stretches: list[Stretch], width: float) -> Base:

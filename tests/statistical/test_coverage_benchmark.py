@@ -114,6 +114,23 @@ def test_a_row_says_what_the_records_say(benchmark):
     assert math.isnan(benchmark.table([line(benchmark, row.cell, 0, verdict="weak")])[0].coverage)
 
 
+def test_cells_measured_anew_replace_theirs(benchmark, tmp_path):
+    old = benchmark.table([line(benchmark, "3/motor_only/1%/white/chirp", 0)])
+    other = benchmark.table([line(benchmark, "175/motor_only/1%/white/chirp", s) for s in range(3)])
+    path = tmp_path / "coverage.csv"
+    benchmark.keep([*old, *other], path)
+    new = benchmark.table([line(benchmark, "3/motor_only/1%/white/chirp", s) for s in range(5)])
+    rows = benchmark.merged(new, path)
+    assert {r.cell: r.records for r in rows} == {
+        "175/motor_only/1%/white/chirp": 3,
+        "3/motor_only/1%/white/chirp": 5,
+    }
+    assert rows == sorted(rows, key=lambda r: r.cell)
+    kept = next(r for r in rows if r.records == 3 and r.symbol == "K")
+    assert kept.spread == pytest.approx(next(r for r in other if r.symbol == "K").spread, rel=1e-5)
+    assert benchmark.targets([r for r in rows if r.symbol in benchmark.JUDGED])
+
+
 def small_version(benchmark, records: int):
     found = []
     for setting in benchmark.settings():
