@@ -79,6 +79,7 @@ class Reversals:
     motor: Side
     load: Side
     zero: float
+    shift: float
 
     def __call__(self, segment: Segment, rate_hz: float) -> tuple[Array, Array]:
         """Velocities of motor and joint, `FINE` steps a period."""
@@ -98,10 +99,18 @@ class Reversals:
         if joint is None:
             raise ValueError("both encoders are needed")
         stiffness = self.motor.stiffness
-        return (motor, segment.torque + stiffness * (joint + self.zero)), (
+        return (motor, delayed(segment.torque, self.shift) + stiffness * (joint + self.zero)), (
             joint,
             stiffness * (motor - self.zero),
         )
+
+
+def delayed(torque: Array, periods: float) -> Array:
+    """A torque that acts ``periods`` later than its stamps say, between them by straight lines."""
+    if periods == 0.0:
+        return torque
+    at = np.arange(torque.size)
+    return np.asarray(np.interp(at - periods, at, torque), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -113,18 +122,22 @@ class MotorReversals:
     motor : Side
     held : ndarray, shape (n,)
         Torque on the motor from what it does not carry itself: from the other end of the spring, and effects.
+    shift : float
+        Periods by which the torque acts later than its stamp says.
     """
 
     motor: Side
     held: Array
+    shift: float
 
     def __call__(self, segment: Segment, rate_hz: float) -> tuple[Array]:
         """The motor's velocity, `FINE` steps a period."""
-        return (self.motor.smoothed(segment.motor_position, segment.torque + self.held, 1.0 / rate_hz)[1],)
+        force = delayed(segment.torque, self.shift) + self.held
+        return (self.motor.smoothed(segment.motor_position, force, 1.0 / rate_hz)[1],)
 
     def doubted(self, segment: Segment, rate_hz: float) -> MotorReversals:
         """The same with as much noise of the equation as the encoder's values ask for."""
-        force = segment.torque + self.held
+        force = delayed(segment.torque, self.shift) + self.held
         return replace(self, motor=self.motor.doubted(segment.motor_position, force, 1.0 / rate_hz))
 
 
@@ -151,7 +164,7 @@ def motor_sharpened(
     total = b.FSm if friction is None else friction
     side = Side(b.Jm, b.FVm, b.K, total, b.motor_reversal, 0.0, noise.motor_position, size)
     stretches = [
-        s.sharpened(MotorReversals(side, torque).doubted(s.segment, rate))
+        s.sharpened(MotorReversals(side, torque, problem.shift).doubted(s.segment, rate))
         for s, torque in zip(problem.recorded, held, strict=True)
     ]
     return problem.at(b, stretches=stretches)
@@ -187,7 +200,7 @@ def sharpened(problem: Problem, effects: Effects = (), friction: Sequence[float]
             ),
             Side(b.JL, b.FV, b.K, total[1], b.load_reversal, load, noise.joint_position, float(load_noise)),
         )
-        stretches.append(recorded.sharpened(Reversals(*sides, b.torsion_zero).doubted(s.segment, rate)))
+        stretches.append(recorded.sharpened(Reversals(*sides, b.torsion_zero, problem.shift).doubted(s.segment, rate)))
     return problem.at(b, stretches=stretches, applied=problem.applied)
 
 

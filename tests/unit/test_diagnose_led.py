@@ -12,14 +12,15 @@ from flexid_cli.diagnose.evidence import predicted
 from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter
 from flexid_cli.diagnose.led import LedFit, Point, refined, residual
 from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.reversals import motor_sharpened
 from flexid_cli.diagnose.search import Form
 from flexid_cli.effects.base import EffectValues
 from flexid_cli.effects.motion import Base
 from flexid_cli.effects.registry import effect
 from flexid_cli.estimate.budget import NoiseLevels
 from flexid_cli.signals.recording import Segment
-from flexid_cli.simulate.engine import simulate_motor_driven
-from flexid_cli.simulate.machine import Axis
+from flexid_cli.simulate.engine import simulate_closed_loop, simulate_motor_driven
+from flexid_cli.simulate.machine import Axis, Controller
 
 RATE, BAND, SAMPLES = 500.0, 30.0, 8_000
 NOISE = NoiseLevels(1.0, 1e-8, 0.0)
@@ -137,3 +138,67 @@ def test_how_the_load_starts_is_found():
         shift=0.0,
     )  # fmt: skip
     assert rms(predicted(late, fitter, found)) == pytest.approx(1.0, abs=0.15)
+
+
+STICKING = replace(BASE, FSm=10.0, motor_reversal=2e-3)
+COARSE = NoiseLevels(1.0, 4e-5, 0.0)  # turns the sign of the motor's velocity about its reversals
+
+
+def sticking(seed: int, base: Base = STICKING, factor: float = 1.0) -> Problem:
+    """A record of an axis with much friction under its controller, which holds the torque for a period.
+
+    Positions times ``factor``, torques over it.
+    """
+    rng, t = np.random.default_rng(seed), np.arange(SAMPLES) / RATE
+    waves = [
+        0.1 / (1.0 + f) * np.sin(2.0 * np.pi * (f * t + rng.random())) for f in (0.3, 0.7, 1.9, 4.1, 8.3)
+    ]
+    axis = Axis(
+        Jm=STICKING.Jm, K=STICKING.K, JL=STICKING.JL, FVm=STICKING.FVm, FSm=STICKING.FSm, FV=STICKING.FV,
+        FS=STICKING.FS, MX=0.0, MY=0.0, reversal_velocity=STICKING.motor_reversal,
+        load_reversal_velocity=STICKING.load_reversal,
+    )  # fmt: skip
+    run = simulate_closed_loop(axis, Controller(15.0, 150.0, 300.0), np.sum(waves, axis=0), RATE)
+    torque = run.torque + COARSE.torque * rng.standard_normal(SAMPLES)
+    motor = run.motor_position + COARSE.motor_position * rng.standard_normal(SAMPLES)
+    segment = Segment(0.0, torque / factor, motor * factor, None)
+    noise = NoiseLevels(COARSE.torque / abs(factor), COARSE.motor_position * abs(factor), 0.0)
+    return Problem(
+        [Stretch(segment, RATE, BAND)], base, noise, BAND, gravity=9.81, gear_ratio=1.0, duration_s=SAMPLES / RATE,
+        both=False, shift=0.5,
+    )  # fmt: skip
+
+
+def test_reversals_of_the_motor_are_told_by_encoder_and_torque_together():
+    p = sticking(3)
+    truth = Point(STICKING, (), (), np.zeros(2))
+    blurred, sharp = residual(p, truth), residual(motor_sharpened(p), truth)
+    assert blurred is not None
+    assert sharp is not None
+    assert rms(blurred) > 1.4 * rms(sharp)
+    assert rms(sharp) < 1.25
+
+
+def test_a_fit_about_noisy_reversals_finds_the_axis():
+    """Each fit tells the reversals anew, by the axis and the effects that it has."""
+    start = replace(STICKING, K=1.04 * BASE.K, JL=0.97 * BASE.JL, FSm=8.0)
+    fitter = Fitter([HARDENING], (0.5,))
+    found = refined(fitter, fitter.fit(sticking(3, start)))
+    assert found is not None
+    assert found.basis.rms == pytest.approx(1.0, abs=0.15)
+    assert pytest.approx(BASE.K, rel=3e-3) == found.problem.base.K
+    assert pytest.approx(STICKING.FSm, rel=0.03) == found.problem.base.FSm
+    assert rms(predicted(sticking(4, start), fitter, found)) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 1e-3])
+def test_a_reversed_axis_and_another_unit_leave_the_same(factor):
+    scaled = {n: getattr(STICKING, n) / factor**2 for n in ("Jm", "JL", "K", "FVm", "FV")}
+    scaled |= {n: getattr(STICKING, n) / abs(factor) for n in ("FSm", "FS")}
+    scaled |= {n: getattr(STICKING, n) * abs(factor) for n in ("motor_reversal", "load_reversal")}
+    base = replace(STICKING, **scaled)
+    here = residual(motor_sharpened(sticking(3)), Point(STICKING, (), (), np.zeros(2)))
+    there = residual(motor_sharpened(sticking(3, base, factor)), Point(base, (), (), np.zeros(2)))
+    assert here is not None
+    assert there is not None
+    assert np.allclose(np.sign(factor) * there, here, atol=1e-3 * rms(here))
