@@ -200,7 +200,8 @@ def sharpened(problem: Problem, effects: Effects = (), friction: Sequence[float]
             ),
             Side(b.JL, b.FV, b.K, total[1], b.load_reversal, load, noise.joint_position, float(load_noise)),
         )
-        stretches.append(recorded.sharpened(Reversals(*sides, b.torsion_zero, problem.shift).doubted(s.segment, rate)))
+        smoother = Reversals(*sides, b.torsion_zero, problem.shift).doubted(s.segment, rate)
+        stretches.append(recorded.sharpened(smoother))
     return problem.at(b, stretches=stretches, applied=problem.applied)
 
 
