@@ -128,6 +128,14 @@ class Search:
             return None
         return shapes
 
+    def spread(self, form: Form, parts: Sequence[float]) -> list[tuple[float, ...]]:
+        """Values of a form's only shape at these parts of its grid."""
+        shapes = self.shapes(form)
+        if not shapes or len(shapes) > 1:
+            return []
+        grid = shapes[0].grid()
+        return [(float(grid[round(part * (grid.size - 1))]),) for part in parts]
+
     def evaluate(self, form: Form, shape: tuple[float, ...], now: Basis) -> Candidate:
         """Fit a form's amplitudes, or take the fixed one, at one shape."""
         C = self.rows(form, shape)

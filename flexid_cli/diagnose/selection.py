@@ -27,6 +27,7 @@ NO_WORSE = 0.5
 WORTH_A_SIMULATION = 0.3  # loss that an alternative may be behind before it is simulated
 # Of several starts: those looked at with effects, how far behind they may be, and steps by simulation.
 MOST_LIKELY, FAR_BEHIND, FEW_STEPS = 3, 1.5, 2
+CURVES = (0.1, 0.35, 0.7)  # starts of a curved friction's shape, over its range
 LOOKED_AT = 0.6  # gain that a rival may be behind before its own refit
 
 
@@ -194,8 +195,17 @@ def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> list[Fitte
     if not possible or possible[0].gain < 0.5 * ENOUGH:
         return []
     rivals = [c for c in possible if c.gain > NEAR_RIVAL * possible[0].gain][:RIVALS]
-    trials = fitter.relaxed(fitted, [(*fitted.chosen, Chosen(c.form, c.shape)) for c in rivals])
+    starts = [Chosen(c.form, c.shape) for c in rivals]
+    if fitted.problem.both:
+        starts += [s for c in rivals for s in _curves(fitter, fitted, c)]
+    trials = fitter.relaxed(fitted, [(*fitted.chosen, s) for s in starts])
     return sorted(trials, key=lambda f: f.loss)
+
+
+def _curves(fitter: Fitter, fitted: Fitted, c: Candidate) -> list[Chosen]:
+    """Other starts for a friction: the reversal's width, fitted without it, has taken the place of a part of it."""
+    forms = [f for f in fitter.forms if f.name == c.form.name and f.signature.curved]
+    return [Chosen(f, shape) for f in forms for shape in fitted.search.spread(f, CURVES)]
 
 
 def _needed(fitter: Fitter, fitted: Fitted, enough: float) -> Fitted:

@@ -107,6 +107,8 @@ class Signature:
         Share of its stiffness that its form leaves open: K is no surer than that.
     rotary : bool
         Whether a linear axis has none.
+    curved : bool
+        Whether it is a friction whose curve over the velocity the width of the reversal can stand in for.
     lawless : bool
         Whether the effect's torque law cannot do what this form does, so that no simulation can speak against it.
     """
@@ -124,4 +126,5 @@ class Signature:
     motor_alone: bool = False
     form_doubt: float = 0.0
     rotary: bool = False
+    curved: bool = False
     lawless: bool = False

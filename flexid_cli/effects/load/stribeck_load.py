@@ -66,5 +66,5 @@ EFFECT = Effect(
     best_recording="Slow sweeps with many reversals, with both encoders.",
     text=__doc__,
     laws=(Law(Stage.LOAD, _torque),),
-    signatures=(Signature(_columns, _values, _shapes, sign=1),),
+    signatures=(Signature(_columns, _values, _shapes, sign=1, curved=True),),
 )

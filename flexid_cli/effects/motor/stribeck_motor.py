@@ -69,5 +69,5 @@ EFFECT = Effect(
     best_recording="Slow sweeps with many reversals, much of the time below the Stribeck velocity.",
     text=__doc__,
     laws=(Law(Stage.MOTOR, _torque),),
-    signatures=(Signature(_columns, _values, _shapes, sign=1),),
+    signatures=(Signature(_columns, _values, _shapes, sign=1, curved=True),),
 )

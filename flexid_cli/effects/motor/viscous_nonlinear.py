@@ -86,6 +86,6 @@ EFFECT = Effect(
     laws=(Law(Stage.MOTOR, _torque),),
     signatures=(
         Signature(_quadratic, _quadratic_values),
-        Signature(_power, _power_values, _exponents, tied=_power_tied),
+        Signature(_power, _power_values, _exponents, tied=_power_tied, curved=True),
     ),
 )
