@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
+import pytest
+
 from flexid_cli.diagnose import selection
+from flexid_cli.diagnose.fitter import Fitter as RecordFitter
+from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.search import Form
+from flexid_cli.effects.base import EffectValues
+from flexid_cli.effects.motion import Base
+from flexid_cli.effects.registry import effect
+from flexid_cli.estimate.budget import NoiseLevels
+from flexid_cli.signals.recording import Segment
+from flexid_cli.simulate.engine import simulate_closed_loop
+from flexid_cli.simulate.machine import Axis, Controller
 
 PROBLEM = SimpleNamespace(both=True, rigid=False)
 
@@ -56,3 +70,45 @@ def test_effects_join_until_nothing_gains(monkeypatch):
     monkeypatch.setattr(selection, "_added", added)
     monkeypatch.setattr(selection, "_needed", lambda fitter, fitted, enough: fitted)
     assert names(selection._grown(Fitter(), Model(), [])) == order
+
+
+RATE, BAND, SAMPLES = 500.0, 30.0, 10_000
+BASE = Base(
+    Jm=3.0, K=4000.0, JL=2.0, FVm=4.0, FSm=3.0, FV=2.0, FS=0.5, motor_reversal=0.004, load_reversal=0.01
+)
+NOISE = NoiseLevels(0.2, 1e-7, 1e-7)
+
+
+def test_a_flat_friction_is_found_although_a_wide_reversal_has_taken_its_place():
+    """The width that fits the reversal without the effect looks like a part of |v|^a: the effect's start is wrong."""
+    rng, t = np.random.default_rng(5), np.arange(SAMPLES) / RATE
+    waves = [
+        0.3 / (1.0 + f) * np.sin(2.0 * np.pi * (f * t + rng.random())) for f in (0.2, 0.5, 1.3, 3.1, 7.0)
+    ]
+    axis = Axis(
+        Jm=BASE.Jm, K=BASE.K, JL=BASE.JL, FVm=BASE.FVm, FSm=BASE.FSm, FV=BASE.FV, FS=BASE.FS, MX=0.0, MY=0.0,
+        reversal_velocity=BASE.motor_reversal, load_reversal_velocity=BASE.load_reversal,
+    )  # fmt: skip
+    hidden = EffectValues("viscous_nonlinear", {"power_friction": 12.0, "power_exponent": 0.5})
+    controller = Controller(15.0, 150.0, 300.0)
+    run = simulate_closed_loop(axis, controller, np.sum(waves, axis=0), RATE, effects=[hidden])
+    segment = Segment(
+        0.0,
+        run.torque + NOISE.torque * rng.standard_normal(SAMPLES),
+        run.motor_position + NOISE.motor_position * rng.standard_normal(SAMPLES),
+        run.joint_position + NOISE.joint_position * rng.standard_normal(SAMPLES),
+    )
+    start = replace(BASE, FVm=20.0, FSm=6.0, motor_reversal=0.02)
+    problem = Problem(
+        [Stretch(segment, RATE, BAND)], start, NOISE, BAND, gravity=9.81, gear_ratio=1.0, duration_s=SAMPLES / RATE,
+        both=True, shift=0.5,
+    )  # fmt: skip
+    forms = [
+        Form(effect(n), k)
+        for n in ("viscous_nonlinear", "stribeck_motor")
+        for k in range(len(effect(n).signatures))
+    ]
+    found = selection.select(RecordFitter(forms, (0.5,)), [problem]).after
+    assert [c.name for c in found.chosen] == ["viscous_nonlinear"]
+    assert found.chosen[0].shape[0] == pytest.approx(0.5, abs=0.1)
+    assert found.basis.rms < 1.3
