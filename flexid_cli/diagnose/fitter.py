@@ -176,6 +176,7 @@ class Fitter:
                 shift=self._shift(fitted),
                 applied=self._errors(fitted),
                 stiffening=fitted.stiffening,
+                passing=passing(fitted),
             )
             fitted = self._shapes(self._reversing(self.fit(moved, fitted.chosen)))
             gained = best.loss - fitted.loss
@@ -204,7 +205,9 @@ class Fitter:
             base = self.moved(fitted)
             if abs(base.K / fitted.problem.base.K - 1.0) < SETTLED_STIFFNESS:
                 break
-            problem = fitted.problem.at(base, applied=self._errors(fitted), stiffening=fitted.stiffening)
+            problem = fitted.problem.at(
+                base, applied=self._errors(fitted), stiffening=fitted.stiffening, passing=passing(fitted)
+            )
             fitted = self.fit(problem, fitted.chosen)
         return fitted
 
@@ -313,13 +316,25 @@ def informed(problem: Problem, fitted: Fitted) -> Problem:
     """
     if not problem.both:
         return trusted(problem)
-    effects: Effects = [
-        (partial(_columns, c.form, c.shape), fitted.amplitudes(k)) for k, c in enumerate(fitted.chosen)
-    ]
+    effects = held(fitted)
     friction = [
         fitted.at_reversal(symbol, getattr(fitted.problem.base, field)) for field, symbol in REVERSALS.items()
     ]
-    return trusted(sharpened(problem, [*effects, _gravity(fitted)], friction), effects)
+    return trusted(
+        sharpened(problem.at(problem.base, passing=passing(fitted)), [*effects, _gravity(fitted)], friction),
+        effects,
+    )
+
+
+def held(fitted: Fitted) -> Effects:
+    """The effects of a model with their amplitudes."""
+    return [(partial(_columns, c.form, c.shape), fitted.amplitudes(k)) for k, c in enumerate(fitted.chosen)]
+
+
+def passing(fitted: Fitted) -> Effects:
+    """Those by which the transmission passes on more than its spring does."""
+    pairs = zip(fitted.chosen, held(fitted), strict=True)
+    return [pair for c, pair in pairs if c.form.effect.equation == "transmission"]
 
 
 def _gravity(fitted: Fitted) -> tuple[Callable[[Motion], Terms], Array]:

@@ -226,6 +226,8 @@ class Problem:
         or of the position that the torque shows: the one lacks effects, the other is blurred by noise.
     trust : sequence of ndarray, optional
         Further weight of each row, shape (equations, rows), by stretch.
+    passing : sequence of pairs, optional
+        Effects of the model by which the transmission passes on more than its spring does.
     """
 
     def __init__(
@@ -247,12 +249,13 @@ class Problem:
         rigid: bool = False,
         led: bool = False,
         trust: Sequence[Array] | None = None,
+        passing: Effects = (),
     ) -> None:
         self.stretches, self.noise, self.band_hz = stretches, noise, band_hz
         self.base = replace(base, gear_ratio=gear_ratio)
         self.gravity, self.gear_ratio, self.duration_s = gravity, gear_ratio, duration_s
         self.both, self.shift, self.anchor = both, shift, anchor
-        self.settled, self.stiffening = settled, stiffening
+        self.settled, self.stiffening, self.passing = settled, stiffening, passing
         self.applied: Mapping[Form, Array] = applied or {}
         self.recorded = stretches
         self.rigid, self.led = rigid, led
@@ -275,6 +278,7 @@ class Problem:
         stiffening: float | None = None,
         led: bool | None = None,
         trust: Sequence[Array] | None = None,
+        passing: Effects | None = None,
     ) -> Problem:
         """The same record linearised elsewhere, with other errors of the joint's position taken out."""
         recorded = self.recorded if stretches is None else stretches
@@ -298,6 +302,7 @@ class Problem:
             rigid=self.rigid,
             led=self.led if led is None else led,
             trust=self.trust if trust is None else trust,
+            passing=self.passing if passing is None else passing,
         )
         other.recorded = recorded
         return other
@@ -370,7 +375,8 @@ class Problem:
             velocity, acceleration = s.derivative(joint, 1), s.derivative(joint, 2)
             sharp = s.derivative(self.led_position(s), 1) if self.led else velocity
             joint_sign = reversal(sharp, base.load_reversal)
-        return Motion(
+        deflection = s.motor_smooth - joint - base.torsion_zero
+        motion = Motion(
             time_s=s.time_s,
             torque=s.torque,
             motor_position=s.motor_smooth,
@@ -380,8 +386,9 @@ class Problem:
             joint_acceleration=acceleration,
             motor_sign=motor_sign,
             joint_sign=joint_sign,
-            deflection=s.motor_smooth - joint - base.torsion_zero,
+            deflection=deflection,
             deflection_rate=s.motor_velocity - velocity,
+            joint_torque=base.K * deflection,
             period_s=s.period_s,
             base=base,
             gravity=self.gravity,
@@ -389,6 +396,11 @@ class Problem:
             joint_encoder=self.both,
             duration_s=self.duration_s,
         )
+        passed = motion.joint_torque
+        for columns, amplitudes in self.passing:
+            more = columns(motion).transmission
+            passed = passed if more is None else passed + more @ amplitudes
+        return replace(motion, joint_torque=passed)
 
     def led_position(self, s: Stretch) -> Array:
         """Where the load goes when the motor moves as measured: no noise of the torque is in it, and no effect."""

@@ -55,6 +55,8 @@ class Motion:
         sgn of the velocities with the baseline's reversal width.
     deflection, deflection_rate : ndarray
         Torsion of the spring, without its zero, and its rate.
+    joint_torque : ndarray
+        Torque that the transmission passes on: its spring's, and that of the effects that the model has there.
     period_s : float
         Sampling period.
     base : Base
@@ -80,6 +82,7 @@ class Motion:
     joint_sign: Array
     deflection: Array
     deflection_rate: Array
+    joint_torque: Array
     period_s: float
     base: Base
     gravity: float

@@ -90,3 +90,36 @@ def test_without_coulomb_friction_all_rows_count_in_full():
     p = trusted(problem(base, NoiseLevels(0.02, ENCODER, 0.0)))
     assert p.trust is not None
     np.testing.assert_array_equal(p.trust[0], 1.0)
+
+
+COUNT = 2e-5
+
+
+def counted(creep: float) -> Problem:
+    """An axis without friction whose encoder counts: waves for ten seconds, then ``creep`` counts a second."""
+    rng = np.random.default_rng(7)
+    base = replace(BASE, FSm=0.0, FS=0.0, FVm=0.0, FV=0.0)
+    q = position() + COUNT * creep * np.clip(TIME - 10.0, 0.0, None)
+    noise = NoiseLevels(0.005, COUNT / np.sqrt(12.0), 0.0)
+    torque = (base.Jm + base.JL) * np.gradient(np.gradient(q)) * RATE**2
+    segment = Segment(
+        0.0, torque + noise.torque * rng.standard_normal(SAMPLES), COUNT * np.round(q / COUNT), None
+    )
+    return trusted(
+        Problem(
+            [Stretch(segment, RATE, BAND)], base, noise, BAND, gravity=9.81, gear_ratio=1.0,
+            duration_s=SAMPLES / RATE, both=False, shift=0.0,
+        )
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("creep", [5.0, 30.0])
+def test_rows_count_less_where_counts_follow_each_other_slowly(creep):
+    """The error of a count that lasts as long as the band's periods lies within the band, not above it."""
+    p = counted(creep)
+    assert p.trust is not None
+    [[trust]] = p.trust
+    fast, slow, e = rows_at(p, MOVING), rows_at(p, RESTING), p.target()
+    assert np.median(trust[fast]) > 0.9
+    assert np.sqrt(np.mean((e[slow] / trust[slow]) ** 2)) > 2.0
+    assert np.sqrt(np.mean(e[slow] ** 2)) == pytest.approx(1.0, abs=0.25)

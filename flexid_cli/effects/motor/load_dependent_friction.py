@@ -41,7 +41,7 @@ def _torque(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
 
 
 def _columns(m: Motion, _: Sequence[float]) -> Terms:
-    return Terms(motor=column(np.abs(m.base.K * m.deflection) * m.motor_sign))
+    return Terms(motor=column(np.abs(m.joint_torque) * m.motor_sign))
 
 
 def _values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
