@@ -10,7 +10,7 @@ import pytest
 from flexid_cli.diagnose.basis import Basis, solve
 from flexid_cli.diagnose.problem import Problem, Stretch
 from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
-from flexid_cli.effects.motion import Base
+from flexid_cli.effects.motion import Base, Motion, Terms
 from flexid_cli.effects.registry import effect, effects
 from flexid_cli.estimate.budget import NoiseLevels
 from flexid_cli.signals.recording import Segment
@@ -216,3 +216,18 @@ def test_what_lies_below_the_noise_is_no_finding():
     assert gained(100.0, 100.0, 10) == 0.0
     assert gained(0.5, 0.05, 10) < 0.05  # nine tenths of next to nothing
     assert gained(1e4, 1e2, 10) == pytest.approx(math.log(100.0), rel=0.05)
+
+
+def test_friction_that_grows_with_the_load_sees_all_that_the_transmission_passes_on(search):
+    def constant(m: Motion) -> Terms:
+        return Terms(transmission=np.ones((m.time_s.size, 1)))
+
+    problem = search.problem
+    more = problem.at(problem.base, passing=[(constant, np.array([5.0]))])
+    plain, passed = problem.motions[0], more.motions[0]
+    np.testing.assert_allclose(plain.joint_torque, BASE.K * plain.deflection)
+    np.testing.assert_allclose(passed.joint_torque - plain.joint_torque, 5.0, rtol=1e-9)
+    columns = form("load_dependent_friction").signature.columns
+    motor = columns(passed, ()).motor
+    assert motor is not None
+    np.testing.assert_allclose(motor[:, 0], np.abs(passed.joint_torque) * passed.motor_sign)
