@@ -59,7 +59,8 @@ LIST_OFFSET["paper"] = 500_000
 SINGLES_PER_KIND = 16
 MOTOR_ONLY_PER_KIND = 10
 OUTSIDE_PER_KIND = 13
-NULLS = 600  # one alarm in 300 would be all that a target of 98 % by its bound allows
+# One alarm in 300 is all that a target of 98 % by its bound allows: as many again stand behind the first ones.
+NULLS, MORE_NULLS = 300, 300
 PAPER_PER_KIND = 16
 NEAR_REST = 0.3  # of the usual travel
 LISTS = tuple(LIST_OFFSET)
@@ -124,8 +125,9 @@ def tasks(group: str, seeds: str) -> list[Task]:
     """
     first = FIRST_SEED[seeds] + LIST_OFFSET[group]
     kinds = list(_kinds(group, first))
-    # Shuffled, so that the first few of a list are a fair sample of it.
-    order = np.random.default_rng(first).permutation(len(kinds))
+    # Shuffled, so that the first few of a list are a fair sample of it; what was added later stands behind.
+    listed = len(kinds) - (MORE_NULLS if group == "nulls" else 0)
+    order = [*np.random.default_rng(first).permutation(listed), *range(listed, len(kinds))]
     alone, paper = group in ("motor_only", "paper"), group == "paper"
     return [Task(group, kinds[k], first + int(k), alone, near_rest=paper) for k in order]
 
@@ -135,7 +137,7 @@ def _kinds(group: str, first: int) -> Iterator[tuple[str, ...]]:
         for kind in BOTH_ENCODERS:
             yield from [(kind,)] * SINGLES_PER_KIND
     elif group == "nulls":
-        yield from [(NONE,)] * NULLS
+        yield from [(NONE,)] * (NULLS + MORE_NULLS)
     elif group == "pairs":
         yield from _pairs(100, np.random.default_rng(first))
     elif group == "motor_only":
