@@ -221,7 +221,9 @@ class Fitter:
 
     @staticmethod
     def _errors(fitted: Fitted) -> dict[Form, Array]:
-        """Errors of the joint's position that the model holds."""
+        """Errors of positions that the model holds (both encoders; a simulation takes them out itself)."""
+        if not fitted.problem.both:
+            return {}
         return {
             c.form: fitted.amplitudes(k)
             for k, c in enumerate(fitted.chosen)

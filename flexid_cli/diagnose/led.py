@@ -206,14 +206,21 @@ def _informed(problem: Problem, fitted: Fitted, point: Point) -> Problem:
 
 def _paths(problem: Problem, point: Point) -> list[Array]:
     """The motor's motion, without what effects of measurement make of it."""
-    out = []
-    for s, m in zip(problem.stretches, problem.motions, strict=True):
-        motor = s.motor
-        for c, a in zip(point.chosen, point.amplitudes, strict=True):
-            error = c.form.signature.columns(m, c.shape).motor_error if _is_signal(c) else None
-            motor = motor if error is None else motor - error @ a
-        out.append(s.lowpass(motor, MOTOR_SIGN_BAND))
-    return out
+    return [
+        s.lowpass(_true_motor(problem, s, m, point), MOTOR_SIGN_BAND)
+        for s, m in zip(problem.stretches, problem.motions, strict=True)
+    ]
+
+
+def _true_motor(problem: Problem, s: Stretch, m: Motion, point: Point) -> Array:
+    motor = s.motor
+    for c, a in zip(point.chosen, point.amplitudes, strict=True):
+        signature = c.form.signature
+        if signature.corrected is not None and signature.corrects == "motor":
+            motor = signature.corrected(motor, a, s.derivative, problem.gear_ratio)
+        elif _is_signal(c) and (error := signature.columns(m, c.shape).motor_error) is not None:
+            motor = motor - error @ a
+    return motor
 
 
 def _rows(problem: Problem, point: Point, runs: Sequence[Trajectory]) -> Array | None:

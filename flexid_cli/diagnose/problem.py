@@ -157,10 +157,6 @@ class Stretch:
     def _spectra(self, signals: Sequence[Array]) -> Complex:
         return np.hstack([self.spectrum(x) for x in signals])
 
-    def with_joint(self, joint: Array) -> Stretch:
-        """The same stretch with another joint position."""
-        return self.like(replace(self.segment, joint_position=joint))
-
     def sharpened(self, sharpener: Sharpener) -> Stretch:
         """The same stretch with another way to tell the velocities where they reverse."""
         return Stretch(self.segment, self.rate_hz, self._band, sharpener)
@@ -209,7 +205,7 @@ class Problem:
     both : bool
         Motor and load equation from both encoders, or eq. (18) from the motor's alone.
     applied : mapping of Form to ndarray
-        Errors of the joint's position that are taken out of the stretches, with their amplitudes.
+        Errors of positions that are taken out of the stretches (both encoders), with their amplitudes.
     anchor : Base, optional
         What stiffness and inertias may not leave by more than `ASTRAY`: without a joint encoder they take up what
         the model lacks.
@@ -280,11 +276,11 @@ class Problem:
         trust: Sequence[Array] | None = None,
         passing: Effects | None = None,
     ) -> Problem:
-        """The same record linearised elsewhere, with other errors of the joint's position taken out."""
+        """The same record linearised elsewhere, with other errors of positions taken out."""
         recorded = self.recorded if stretches is None else stretches
         stretches = self.stretches if stretches is None else stretches
         if applied is not None and (applied or self.applied):
-            stretches = [_without_errors(s, applied) for s in recorded]
+            stretches = [_without_errors(s, applied, self.gear_ratio) for s in recorded]
         other = Problem(
             stretches,
             base,
@@ -727,18 +723,21 @@ def _reversal_step(velocities: Sequence[Array], rate_hz: float, cutoff_hz: float
     return float(np.median(found) * reach) if found.size else 0.0
 
 
-def _without_errors(s: Stretch, applied: Mapping[Form, Array]) -> Stretch:
-    """The stretch with the joint's position as it was before errors of measurement."""
-    joint = s.joint
+def _without_errors(s: Stretch, applied: Mapping[Form, Array], gear_ratio: float) -> Stretch:
+    """The stretch with the positions as they were before errors of measurement."""
+    true = {"motor": s.motor, "joint": s.joint}
 
     def banded(x: Array, order: int) -> Array:
         """Derivative without noise above the band, which a skew of some samples would lift a hundred times."""
         return s.derivative(s.lowpass(x, JOINT_SIGN_BAND), order)
 
     for form, amplitudes in applied.items():
+        sensor = form.signature.corrects
         if form.signature.corrected is not None:
-            joint = form.signature.corrected(joint, amplitudes, banded)
-    return s if joint is s.joint else s.with_joint(joint)
+            true[sensor] = form.signature.corrected(true[sensor], amplitudes, banded, gear_ratio)
+    if not applied:
+        return s
+    return s.like(replace(s.segment, motor_position=true["motor"], joint_position=true["joint"]))
 
 
 def later(s: Stretch, spectrum: Complex, periods: float) -> Complex:

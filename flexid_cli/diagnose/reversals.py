@@ -74,11 +74,22 @@ class Side:
 
 @dataclass(frozen=True)
 class Reversals:
-    """Smoother of the velocities of one stretch, and of the same stretch with other noise."""
+    """Smoother of the velocities of one stretch, and of the same stretch with other noise or less errors.
+
+    Attributes
+    ----------
+    motor, load : Side
+    zero, torsion : float
+        Difference of the encoders where the spring carries nothing, and its mean in the stretch for which that holds:
+        an error that is taken out of a position changes both.
+    shift : float
+        Periods by which the torque acts later than its stamp says.
+    """
 
     motor: Side
     load: Side
     zero: float
+    torsion: float
     shift: float
 
     def __call__(self, segment: Segment, rate_hz: float) -> tuple[Array, Array]:
@@ -99,9 +110,10 @@ class Reversals:
         if joint is None:
             raise ValueError("both encoders are needed")
         stiffness = self.motor.stiffness
-        return (motor, delayed(segment.torque, self.shift) + stiffness * (joint + self.zero)), (
+        zero = self.zero + float(np.mean(motor - joint)) - self.torsion
+        return (motor, delayed(segment.torque, self.shift) + stiffness * (joint + zero)), (
             joint,
-            stiffness * (motor - self.zero),
+            stiffness * (motor - zero),
         )
 
 
@@ -200,7 +212,8 @@ def sharpened(problem: Problem, effects: Effects = (), friction: Sequence[float]
             ),
             Side(b.JL, b.FV, b.K, total[1], b.load_reversal, load, noise.joint_position, float(load_noise)),
         )
-        smoother = Reversals(*sides, b.torsion_zero, problem.shift).doubted(s.segment, rate)
+        torsion = float(np.mean(s.motor - s.joint))
+        smoother = Reversals(*sides, b.torsion_zero, torsion, problem.shift).doubted(s.segment, rate)
         stretches.append(recorded.sharpened(smoother))
     return problem.at(b, stretches=stretches, applied=problem.applied)
 

@@ -72,7 +72,7 @@ def first_problems(
     stretches = [Stretch(s, rate, band) for s in segments]
     speed = float(np.quantile(np.abs(np.concatenate([s.motor_velocity for s in stretches])), 0.98))
     width = FIRST_WIDTH * speed
-    base = (_both_base if both else _rigid_base)(stretches, width)
+    base = _first_base(stretches, width, both, fitted)
     if rigid:
         base = replace(
             base,
@@ -102,6 +102,16 @@ def first_problems(
     for one in problems:
         one.anchor, one.settled = one.base, known is not None
     return [trusted(motor_sharpened(_with_torque_noise(one))) for one in problems]
+
+
+def _first_base(stretches: list[Stretch], width: float, both: bool, fitted: Problem | None) -> Base:
+    """A simple fit's parameters, or those of another record of the axis where this one alone shows none."""
+    try:
+        return (_both_base if both else _rigid_base)(stretches, width)
+    except DataError:
+        if fitted is None:
+            raise
+        return fitted.base
 
 
 def _both_base(stretches: list[Stretch], width: float) -> Base:

@@ -92,8 +92,10 @@ class Signature:
     tied : callable or None
         (amplitudes, shape values, Base) -> why these values cannot be the effect, or an empty string.
     corrected : callable or None
-        (joint position as recorded, amplitudes, derivative) -> the position that the effect leaves when it is taken
-        out; with it the equations are linearised about the true motion. ``derivative(x, order)``.
+        (position as recorded, amplitudes, derivative, gear ratio) -> the position that the effect leaves when it is
+        taken out; with it the equations are linearised about the true motion. ``derivative(x, order)``.
+    corrects : {"joint", "motor"}
+        Whose position that is.
     ripple : {"motor", "transmission", ""}
         Equation in which the (first two) columns are `forms.sines` of the motor's position with the shape as cycles
         per radian: such a search can be made at once for all cycles.
@@ -119,7 +121,8 @@ class Signature:
     fixed: float | None = None
     sign: int = 0
     tied: Callable[[Array, Sequence[float], Base], str] | None = None
-    corrected: Callable[[Array, Array, Callable[[Array, int], Array]], Array] | None = None
+    corrected: Callable[[Array, Array, Callable[[Array, int], Array], float], Array] | None = None
+    corrects: str = "joint"
     ripple: str = ""
     extends: bool = False
     needs_joint: bool = False

@@ -194,3 +194,23 @@ def test_columns_agree_with_the_law_of_the_simulation(name: str, index: int):
         size = float(np.linalg.norm(told))
         assert np.linalg.norm(misfit(problem_of(none, both, shift))) < 0.02 * size
         assert np.linalg.norm(seen - told) < (0.05 if both else 0.1) * size
+
+
+@pytest.mark.parametrize(("index", "sizes"), [(0, (0.08, -0.05)), (1, (3e-3, 2e-3))])
+def test_a_wave_of_an_encoder_is_taken_out_with_its_overtones(index: int, sizes: tuple[float, float]):
+    """Its overtone, 3 to 9 % of it, would be named as an effect of its own."""
+    form, amplitudes = Form(effect("encoder_eccentricity"), index), np.array(sizes)
+    run, none = (run_of(form.name, v) for v in (form.signature.values(amplitudes, (), BASE), None))
+    problem = problem_of(run, both=True)
+    first_order = misfit(problem) - problem.effect_rows(lambda m: form.signature.columns(m, ()))[0] @ amplitudes
+    taken_out = misfit(problem.at(BASE, applied={form: amplitudes}))
+    plain = np.linalg.norm(misfit(problem_of(none, both=True)))
+    assert np.linalg.norm(taken_out) < 1.1 * plain
+    assert np.linalg.norm(first_order) > 20.0 * plain
+
+
+def test_a_wave_that_no_encoder_could_have_is_not_taken_out():
+    form = Form(effect("encoder_eccentricity"), 1)
+    correct = form.signature.corrected
+    assert correct is not None
+    assert correct(MOTOR, np.array([0.02, 0.0]), lambda x, _: x, GEAR) is MOTOR

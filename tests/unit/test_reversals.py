@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flexid_cli.diagnose.mean_sign import FINE, between, mean_sign
-from flexid_cli.diagnose.reversals import Side
+from flexid_cli.diagnose.reversals import Reversals, Side
+from flexid_cli.signals.recording import Segment
 
 RATE, SAMPLES, STEPS = 500.0, 5_000, 40
 INERTIA, DAMPING, FRICTION, WIDTH = 2.0, 1.0, 5.0, 0.002
@@ -86,3 +89,14 @@ def test_the_mean_of_a_sign_holds_the_time_at_which_it_turns(share):
 def test_a_sign_that_does_not_turn_is_that_of_its_velocity():
     fine = np.full(FINE * 9 + 1, 0.003)
     np.testing.assert_allclose(mean_sign(fine, 0.002), np.tanh(1.5), rtol=1e-9)
+
+
+def test_an_error_that_is_taken_out_of_a_position_takes_the_springs_zero_with_it(motion):
+    """Else the spring would pull at the motor with a torque that is not there, and turn signs."""
+    position, _ = motion
+    motor, load = (replace(side(0.05), stiffness=500.0) for _ in range(2))
+    joint = position - force_at(TIME) / 500.0
+    both = Reversals(motor, load, 0.0, float(np.mean(position - joint)), 0.0)
+    record, moved = (Segment(0.0, 2.0 * force_at(TIME), position, joint + e) for e in (0.0, 2e-3))
+    for plain, other in zip(both(record, RATE), both(moved, RATE), strict=True):
+        assert other == pytest.approx(plain, abs=1e-6 * np.ptp(plain))

@@ -41,7 +41,7 @@ def _columns(m: Motion, _: Sequence[float]) -> Terms:
     return Terms(joint_error=column(-m.joint_velocity))
 
 
-def _corrected(joint: Array, a: Array, derivative: Callable[[Array, int], Array]) -> Array:
+def _corrected(joint: Array, a: Array, derivative: Callable[[Array, int], Array], _: float) -> Array:
     """The position at the stamp: Taylor's series, which three terms end for skews of a few samples."""
     skew = float(a[0])
     terms = [skew**k / factorial(k) * derivative(joint, k) for k in (1, 2, 3)]

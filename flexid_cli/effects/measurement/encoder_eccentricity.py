@@ -22,7 +22,7 @@ Literature
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from flexid_cli.effects.forms import amplitude_and_phase, sines
 from flexid_cli.effects.motion import Base, Motion, Shape, Terms
 from flexid_cli.effects.signature import Scale, Signature
 
+MOST_WAVE, NEAR, ROUNDS = 0.5, 1e-12, 60  # slope of a wave that is taken out, and how near the angle is found
+
+
 
 def _measurement(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     joint = w[slots.MEASURED_JOINT] + p[1]
@@ -40,6 +43,26 @@ def _measurement(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     motor = p[4] * w[slots.MEASURED_MOTOR] + p[3]
     w[slots.MEASURED_MOTOR] += p[2] * math.sin(motor)
     w[slots.MEASURED_MOTOR_RATE] *= 1.0 + p[2] * p[4] * math.cos(motor)
+
+
+def _centred(measured: Array, a: Array, cycles: float) -> Array:
+    """The angle of which the wave makes the measured one: x + a sin(n x) = measured, which repetition solves."""
+    if float(np.hypot(*a)) * cycles > MOST_WAVE:  # no encoder's: the angle would all but stand still in places
+        return measured
+    angle = measured
+    for _ in range(ROUNDS):
+        before, angle = angle, measured - sines(angle, cycles) @ a
+        if np.max(np.abs(angle - before)) < NEAR:
+            break
+    return angle
+
+
+def _joint_corrected(joint: Array, a: Array, _: Callable[[Array, int], Array], __: float) -> Array:
+    return _centred(joint, a, 1.0)
+
+
+def _motor_corrected(motor: Array, a: Array, _: Callable[[Array, int], Array], gear_ratio: float) -> Array:
+    return _centred(motor, a, gear_ratio)
 
 
 def _joint(m: Motion, _: Sequence[float]) -> Terms:
@@ -85,7 +108,9 @@ EFFECT = Effect(
     laws=(Law(Stage.MEASUREMENT, _measurement),),
     energy="exchanges",
     signatures=(
-        Signature(_joint, _joint_values, needs_joint=True, rotary=True),
-        Signature(_motor, _motor_values, _once_a_turn, rotary=True),
+        Signature(_joint, _joint_values, needs_joint=True, rotary=True, corrected=_joint_corrected),
+        Signature(
+            _motor, _motor_values, _once_a_turn, rotary=True, corrected=_motor_corrected, corrects="motor"
+        ),
     ),
 )

@@ -50,7 +50,7 @@ def _joint(m: Motion, _: Sequence[float]) -> Terms:
     return Terms(joint_error=column(-m.joint_velocity))
 
 
-def _joint_corrected(joint: Array, a: Array, derivative: Callable[[Array, int], Array]) -> Array:
+def _joint_corrected(joint: Array, a: Array, derivative: Callable[[Array, int], Array], _: float) -> Array:
     """The inverse of a first-order lag."""
     return np.asarray(joint + float(a[0]) * derivative(joint, 1))
 
