@@ -202,7 +202,9 @@ def test_a_wave_of_an_encoder_is_taken_out_with_its_overtones(index: int, sizes:
     form, amplitudes = Form(effect("encoder_eccentricity"), index), np.array(sizes)
     run, none = (run_of(form.name, v) for v in (form.signature.values(amplitudes, (), BASE), None))
     problem = problem_of(run, both=True)
-    first_order = misfit(problem) - problem.effect_rows(lambda m: form.signature.columns(m, ()))[0] @ amplitudes
+    first_order = (
+        misfit(problem) - problem.effect_rows(lambda m: form.signature.columns(m, ()))[0] @ amplitudes
+    )
     taken_out = misfit(problem.at(BASE, applied={form: amplitudes}))
     plain = np.linalg.norm(misfit(problem_of(none, both=True)))
     assert np.linalg.norm(taken_out) < 1.1 * plain

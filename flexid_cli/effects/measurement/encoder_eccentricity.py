@@ -35,7 +35,6 @@ from flexid_cli.effects.signature import Scale, Signature
 MOST_WAVE, NEAR, ROUNDS = 0.5, 1e-12, 60  # slope of a wave that is taken out, and how near the angle is found
 
 
-
 def _measurement(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
     joint = w[slots.MEASURED_JOINT] + p[1]
     w[slots.MEASURED_JOINT] += p[0] * math.sin(joint)
@@ -47,7 +46,9 @@ def _measurement(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
 
 def _centred(measured: Array, a: Array, cycles: float) -> Array:
     """The angle of which the wave makes the measured one: x + a sin(n x) = measured, which repetition solves."""
-    if float(np.hypot(*a)) * cycles > MOST_WAVE:  # no encoder's: the angle would all but stand still in places
+    if (
+        float(np.hypot(*a)) * cycles > MOST_WAVE
+    ):  # no encoder's: the angle would all but stand still in places
         return measured
     angle = measured
     for _ in range(ROUNDS):
