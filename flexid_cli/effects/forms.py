@@ -15,6 +15,8 @@ from flexid_cli.pipeline import filters
 Array = NDArray[np.float64]
 
 MOST_POINTS = 500
+# Periods in the range of motion: a wave that hardly repeats is any function of the position. See docs/diagnosis.md.
+LEAST_PERIODS = 2.5
 
 
 def column(x: Array) -> Array:
@@ -34,12 +36,12 @@ def amplitude_and_phase(amplitudes: Array) -> tuple[float, float]:
 
 
 def cycles_range(scale: Scale, name: str) -> Sequence[Shape] | None:
-    """Cycles per radian of motor motion that this record can show; None where it moves less than two of them."""
-    low = 2.0 * math.pi / max(scale.motor_range, 1e-12)
-    high = 2.0 * math.pi * scale.band_hz / (CYCLES_PER_SPEED * scale.motor_speed)
-    if high <= 2.0 * low:
+    """Cycles per radian of motor motion that this record can show; None where there are none."""
+    once = 2.0 * math.pi / max(scale.motor_range, 1e-12)
+    low, high = LEAST_PERIODS * once, 2.0 * math.pi * scale.band_hz / (CYCLES_PER_SPEED * scale.motor_speed)
+    if high <= low:
         return None
-    points = int(np.clip(POINTS_PER_CYCLE * (high - low) / low, 12, MOST_POINTS))
+    points = int(np.clip(POINTS_PER_CYCLE * (high - low) / once, 12, MOST_POINTS))
     return (Shape(name, low, high, points, "linear"),)
 
 

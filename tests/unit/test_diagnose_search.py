@@ -10,6 +10,7 @@ import pytest
 from flexid_cli.diagnose.basis import Basis, solve
 from flexid_cli.diagnose.problem import Problem, Stretch
 from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
+from flexid_cli.effects.forms import LEAST_PERIODS
 from flexid_cli.effects.motion import Base, Motion, Terms
 from flexid_cli.effects.registry import effect, effects
 from flexid_cli.estimate.budget import NoiseLevels
@@ -134,6 +135,15 @@ def test_the_overtone_of_a_ripple_is_found_with_it(search, second):
     assert candidate.shape[0] == pytest.approx(14.3, abs=0.03)
     assert values(search, candidate)["cogging_torque"] == pytest.approx(0.4, rel=0.05)
     assert values(search, candidate)["second_torque"] == pytest.approx(second * 0.4, rel=0.05)
+
+
+def test_a_wave_that_hardly_repeats_is_no_ripple(search):
+    """A sine over the whole range of motion is a function of the position like any other."""
+    once = 2.0 * math.pi / search.scale.motor_range
+    [shape] = search.shapes(form("cogging"))
+    assert shape.low == pytest.approx(LEAST_PERIODS * once)
+    now = planted(search, form("cogging"), (1.5 * once,), [0.4, 0.0])
+    assert found(search, form("cogging"), now).shape[0] >= LEAST_PERIODS * once
 
 
 def test_a_record_that_hardly_moves_shows_no_ripple(search):
