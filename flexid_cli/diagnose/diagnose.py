@@ -27,8 +27,8 @@ from flexid_cli.diagnose.result import (
     Verdict,
     Where,
 )
-from flexid_cli.diagnose.search import Candidate, Form
-from flexid_cli.diagnose.selection import Selection, select, threshold
+from flexid_cli.diagnose.search import Candidate, Form, gained
+from flexid_cli.diagnose.selection import Selection, least_gain, select, threshold
 from flexid_cli.diagnose.simulation import simulation_error
 from flexid_cli.diagnose.start import first_problems, has_joint
 from flexid_cli.diagnose.suggest import interval, suggestions
@@ -77,7 +77,13 @@ def diagnose(
     both = has_joint(recording, config)
     fitter = Fitter(forms_of(both, linear=recording.linear), torque_shifts(config))
     selection = select(fitter, first_problems(recording, config, fitter))
-    return _Report(fitter, selection, recording, config, validation, known or {}).diagnosis()
+    own = _Report(fitter, selection, recording, config, validation, known or {})
+    if validation is None or own.verdict != "adequate" or own.holds_elsewhere():
+        return own.diagnosis()
+    selection = select(fitter, first_problems(validation, config, fitter, own.final.problem))
+    other = _Report(fitter, selection, validation, config, recording, known or {})
+    told = other.verdict in ("explained", "ambiguous") and other.holds_elsewhere()
+    return _exchanged(other.diagnosis()) if told else own.diagnosis()
 
 
 def forms_of(both: bool, *, linear: bool = False) -> list[Form]:
@@ -196,6 +202,11 @@ class _Report:
         parts = evidence.by_equation(self.other, self.unseen[1]).values()
         worst = max(float(np.sqrt(np.mean(part**2))) for part in parts)
         return worst if worst > verdict.UNEXPLAINED_RMS else 0.0
+
+    def holds_elsewhere(self) -> bool:
+        """Whether the model leaves less on the other recording than what could name an effect there."""
+        _, left = self.unseen
+        return gained(float(left @ left), float(left.size), left.size) < least_gain(self.final)
 
     def _base_parameters(
         self, fitted: Fitted, result: Solved, doubt: str, alternatives: Sequence[Fitted] = ()
@@ -359,6 +370,16 @@ def _timed(named: tuple[NamedEffect, ...], place: Where | None) -> tuple[NamedEf
     if len(named) != 1 or place is None or place.interval is None:
         return named
     return (replace(named[0], where=replace(named[0].where, interval=place.interval)),)
+
+
+def _exchanged(diagnosis: Diagnosis) -> Diagnosis:
+    """The diagnosis of the recording for validation, where that alone shows what the model lacks."""
+    note = (
+        "the recording holds nothing that the model lacks, the one for validation does: that was diagnosed and the"
+        " other one was the check; parameters, places and times are those of the recording for validation"
+    )
+    text = f"Only the recording for validation shows it. {diagnosis.sentence}"
+    return replace(diagnosis, sentence=text, notes=(note, *diagnosis.notes))
 
 
 def _with_suggestion(text: str, place: Where | None, verdict: Verdict) -> str:

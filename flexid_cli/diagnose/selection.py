@@ -28,6 +28,7 @@ WORTH_A_SIMULATION = 0.3  # loss that an alternative may be behind before it is 
 # Of several starts: those looked at with effects, how far behind they may be, and steps by simulation.
 MOST_LIKELY, FAR_BEHIND, FEW_STEPS = 3, 1.5, 2
 CURVES = (0.1, 0.35, 0.7)  # starts of a curved friction's shape, over its range
+MOST_ROUNDS, STILL = 5, 0.01  # of moving all shapes again, and the change of loss that ends it
 LOOKED_AT = 0.6  # gain that a rival may be behind before its own refit
 
 
@@ -86,11 +87,27 @@ def _grown(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
             break
         grown = fitter.reweighted(_needed(fitter, trials[0], enough))
         if _names(grown) in seen:  # rows are weighted anew by each set of effects: it could go round for ever
+            fitted = _better(fitted, grown)
             break
         fitted = grown
         seen.add(_names(fitted))
         found = fitter.candidates(fitted)
+    return _settled(fitter, fitted)
+
+
+def _settled(fitter: Fitter, fitted: Fitted) -> Fitted:
+    """The fit where its shapes no longer move: one that was far off has drawn the others along."""
+    for _ in range(MOST_ROUNDS if fitted.chosen else 0):
+        moved = fitter.reweighted(fitter.relax(fitted.problem, fitted.chosen))
+        if moved.loss > fitted.loss - STILL:
+            break
+        fitted = moved
     return fitted
+
+
+def _better(fitted: Fitted, again: Fitted) -> Fitted:
+    """Of two fits of the same effects the likelier one: the shapes of some have several minima."""
+    return again if _names(again) == _names(fitted) and again.loss < fitted.loss else fitted
 
 
 def _names(fitted: Fitted) -> frozenset[str]:
@@ -118,6 +135,7 @@ def _grown_led(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted
             break
         grown = _confirmed(fitter, new) if len(new.chosen) > 1 else new
         if _names(grown) in seen:
+            fitted = _better(fitted, grown)
             break
         fitted = grown
         seen.add(_names(fitted))
@@ -187,6 +205,11 @@ def _led(fitter: Fitter, fitted: Fitted) -> Fitted:
 def threshold(problem: Problem) -> float:
     """Least gain that names an effect in this record."""
     return ENOUGH if problem.both or problem.rigid else ENOUGH_ALONE
+
+
+def least_gain(fitted: Fitted) -> float:
+    """Least gain that names an effect beyond this model, by simulation where that is one."""
+    return ENOUGH_LED if isinstance(fitted, LedFit) else threshold(fitted.problem)
 
 
 def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> list[Fitted]:

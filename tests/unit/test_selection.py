@@ -26,9 +26,9 @@ PROBLEM = SimpleNamespace(both=True, rigid=False)
 class Model:
     """A fit that says of every change that it gains."""
 
-    def __init__(self, *names: str) -> None:
+    def __init__(self, *names: str, loss: float = 0.0) -> None:
         self.chosen = tuple(SimpleNamespace(name=n) for n in names)
-        self.problem = PROBLEM
+        self.problem, self.loss = PROBLEM, loss
 
     def gain(self, _: Model) -> float:
         return 1.0
@@ -39,7 +39,16 @@ def names(model: Model) -> list[str]:
 
 
 class Fitter:
-    """Effects are offered in turn; weighting the rows anew leaves a model as it is."""
+    """Effects are offered in turn; weighting the rows anew leaves a model as it is.
+
+    Moving its shapes again gives each time one of the fits that are told.
+    """
+
+    def __init__(self, *further: Model) -> None:
+        self.further = list(further)
+
+    def relax(self, *_: object) -> Model:
+        return self.further.pop(0) if self.further else Model()
 
     def candidates(self, _: Model) -> list:
         return []
@@ -70,6 +79,20 @@ def test_effects_join_until_nothing_gains(monkeypatch):
     monkeypatch.setattr(selection, "_added", added)
     monkeypatch.setattr(selection, "_needed", lambda fitter, fitted, enough: fitted)
     assert names(selection._grown(Fitter(), Model(), [])) == order
+
+
+def test_the_same_effects_fitted_better_take_the_place_of_the_first_fit(monkeypatch):
+    """An effect that stood in for a bad shape of another one goes again, and leaves the other one better."""
+    trials = [Model("backlash", loss=1.0), Model("backlash", loss=-1.0)]
+    monkeypatch.setattr(selection, "_added", lambda *_: [trials.pop(0)])
+    monkeypatch.setattr(selection, "_needed", lambda fitter, fitted, enough: fitted)
+    assert selection._grown(Fitter(), Model(), []).loss == -1.0
+
+
+def test_shapes_are_moved_until_they_stay():
+    further = [Model("backlash", loss=loss) for loss in (3.0, 1.0, 0.999, -5.0)]
+    assert selection._settled(Fitter(*further), Model("backlash", loss=4.0)).loss == 1.0
+    assert selection._settled(Fitter(*further), Model(loss=4.0)).loss == 4.0
 
 
 RATE, BAND, SAMPLES = 500.0, 30.0, 10_000

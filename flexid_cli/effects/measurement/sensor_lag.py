@@ -28,9 +28,9 @@ import numpy as np
 
 from flexid_cli.effects import slots
 from flexid_cli.effects.base import Array, Effect, EffectParameter, EffectState, Law, Stage
-from flexid_cli.effects.forms import column, lagged
-from flexid_cli.effects.motion import Base, Motion, Shape, Terms
-from flexid_cli.effects.signature import Scale, Signature
+from flexid_cli.effects.forms import column
+from flexid_cli.effects.motion import Base, Motion, Terms
+from flexid_cli.effects.signature import Signature
 
 
 def _measurement(w: Array, p: Array, x: Array, dx: Array, _g: Array) -> None:
@@ -50,25 +50,21 @@ def _joint(m: Motion, _: Sequence[float]) -> Terms:
     return Terms(joint_error=column(-m.joint_velocity))
 
 
-def _joint_corrected(joint: Array, a: Array, derivative: Callable[[Array, int], Array], _: float) -> Array:
+def _motor(m: Motion, _: Sequence[float]) -> Terms:
+    return Terms(motor_error=column(-m.motor_velocity))
+
+
+def _corrected(position: Array, a: Array, derivative: Callable[[Array, int], Array], _: float) -> Array:
     """The inverse of a first-order lag."""
-    return np.asarray(joint + float(a[0]) * derivative(joint, 1))
-
-
-def _motor(m: Motion, shape: Sequence[float]) -> Terms:
-    return Terms(motor_error=column(lagged(m.motor_position, shape[0], m.period_s) - m.motor_position))
-
-
-def _lags(scale: Scale) -> Sequence[Shape]:
-    return (Shape("lag", 0.1 * scale.period_s, 0.1 / scale.resonance_hz, 10),)
+    return np.asarray(position + float(a[0]) * derivative(position, 1))
 
 
 def _joint_values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
     return {"joint_lag": float(a[0])}
 
 
-def _motor_values(_: Array, shape: Sequence[float], __: Base) -> dict[str, float]:
-    return {"motor_lag": shape[0]}
+def _motor_values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
+    return {"motor_lag": float(a[0])}
 
 
 EFFECT = Effect(
@@ -88,7 +84,7 @@ EFFECT = Effect(
     states=(EffectState("joint", "joint_position"), EffectState("motor", "motor_position")),
     energy="exchanges",
     signatures=(
-        Signature(_joint, _joint_values, sign=1, needs_joint=True, corrected=_joint_corrected),
-        Signature(_motor, _motor_values, _lags, fixed=1.0, needs_joint=True),
+        Signature(_joint, _joint_values, sign=1, needs_joint=True, corrected=_corrected),
+        Signature(_motor, _motor_values, sign=1, needs_joint=True, corrected=_corrected, corrects="motor"),
     ),
 )
