@@ -28,7 +28,7 @@ from flexid_cli.diagnose.result import (
     Where,
 )
 from flexid_cli.diagnose.search import Candidate, Form, gained
-from flexid_cli.diagnose.selection import Selection, least_gain, select, threshold
+from flexid_cli.diagnose.selection import Selection, least_gain, select
 from flexid_cli.diagnose.simulation import simulation_error
 from flexid_cli.diagnose.start import first_problems, has_joint
 from flexid_cli.diagnose.suggest import interval, suggestions
@@ -246,7 +246,7 @@ class _Report:
             family=effect.family,
             alternatives=tuple(dict.fromkeys(f.chosen[-1].name for f in self.selection.alternatives[k])),
             parameters=parameters,
-            evidence=Evidence(gain, threshold(final.problem), score.p_value, validated, score.stability),
+            evidence=Evidence(gain, least_gain(final), score.p_value, validated, score.stability),
             where=Where(effect.equation, _variable(effect.equation, self.maps)),
         )
 
@@ -330,7 +330,7 @@ class _Report:
             return candidate.refused
         if chosen and name in rivals:
             return f"leaves {100.0 * np.expm1(rivals[name]):.3g} % more than the effects that were named"
-        return f"explains too little (gain below {threshold(self.final.problem):g})"
+        return f"explains too little (gain below {least_gain(self.final):g})"
 
     def _contradicted(self, estimates: tuple[Estimate, ...]) -> tuple[str, ...]:
         """Known parameters that lie outside their intervals."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,10 @@ class Chosen:
     def name(self) -> str:
         """Name of the effect."""
         return self.form.name
+
+    def terms(self, motion: Motion) -> Terms:
+        """What it adds to the equations for unit amplitudes."""
+        return self.form.signature.columns(motion, self.shape)
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ class Fitted:
         for k, c in enumerate(self.chosen):
             product = size = 0.0
             for m in problem.motions:
-                terms = c.form.signature.columns(m, c.shape)
+                terms = c.terms(m)
                 motor = symbol == "FSm"
                 torque = terms.motor if motor else terms.load
                 sign, v = (m.motor_sign, m.motor_velocity) if motor else (m.joint_sign, m.joint_velocity)
@@ -330,7 +334,7 @@ def informed(problem: Problem, fitted: Fitted) -> Problem:
 
 def held(fitted: Fitted) -> Effects:
     """The effects of a model with their amplitudes."""
-    return [(partial(_columns, c.form, c.shape), fitted.amplitudes(k)) for k, c in enumerate(fitted.chosen)]
+    return [(c.terms, fitted.amplitudes(k)) for k, c in enumerate(fitted.chosen)]
 
 
 def passing(fitted: Fitted) -> Effects:
@@ -348,10 +352,6 @@ def _gravity(fitted: Fitted) -> tuple[Callable[[Motion], Terms], Array]:
         return Terms(load=m.gravity * np.column_stack([np.cos(m.joint_position), np.sin(m.joint_position)]))
 
     return columns, share * fitted.basis.coefficients[first : first + 2]
-
-
-def _columns(form: Form, shape: tuple[float, ...], m: Motion) -> Terms:
-    return form.signature.columns(m, shape)
 
 
 def without(chosen: Sequence[Chosen], k: int) -> tuple[Chosen, ...]:
