@@ -56,7 +56,9 @@ class Point:
 
     @classmethod
     def of(cls, fitted: Fitted) -> Point:
-        """Where a linear fit ended."""
+        """Where a fit ended."""
+        if isinstance(fitted, LedFit):
+            return fitted.point
         names, problem = fitted.problem.names, fitted.problem
         coefficients = fitted.basis.coefficients[: len(names)]
         values = {n: problem.linearised(n) + float(c) for n, c in zip(names, coefficients, strict=True)}
@@ -264,6 +266,11 @@ class LedFit(Fitted):
     """A fit by simulation: ``basis`` is linear about its ``point``."""
 
     point: Point
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether what it leaves is about the noise."""
+        return self.cost < ABOVE_NOISE * self.y.size
 
 
 @dataclass(frozen=True)

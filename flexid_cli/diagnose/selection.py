@@ -62,6 +62,8 @@ def select(fitter: Fitter, problems: Sequence[Problem]) -> Selection:
     """Search the library for what the record holds beyond the baseline, from the likeliest of some linearisations."""
     problem, elsewhere = _start(fitter, problems)
     before = fitter.relax(problem)
+    if problem.both:
+        before = _settled(fitter, before)
     tested = fitter.candidates(before)
     if problem.both or problem.rigid:
         fitted = _grown(fitter, before, tested)
@@ -96,8 +98,8 @@ def _grown(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
 
 
 def _settled(fitter: Fitter, fitted: Fitted) -> Fitted:
-    """The fit where its shapes no longer move: one that was far off has drawn the others along."""
-    for _ in range(MOST_ROUNDS if fitted.chosen else 0):
+    """The fit where shapes and reversals no longer move: one that was far off has drawn the others along."""
+    for _ in range(MOST_ROUNDS):
         moved = fitter.reweighted(fitter.relax(fitted.problem, fitted.chosen))
         if moved.loss > fitted.loss - STILL:
             break
@@ -140,6 +142,21 @@ def _grown_led(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted
         fitted = grown
         seen.add(_names(fitted))
         found = fitter.candidates(fitted)
+    return _settled_led(fitter, fitted)
+
+
+def _settled_led(fitter: Fitter, fitted: Fitted) -> Fitted:
+    """The fit by simulation where further steps, from reversals told anew, no longer help.
+
+    Gaps that open and signs that turn make the residual rough: steps get caught.
+    """
+    for _ in range(MOST_ROUNDS):
+        if not isinstance(fitted, LedFit) or fitted.is_noise:
+            break
+        moved = refined(fitter, fitted)
+        if moved is None or moved.loss > fitted.loss - STILL:
+            break
+        fitted = moved
     return fitted
 
 
