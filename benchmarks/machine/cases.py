@@ -61,6 +61,8 @@ MOTOR_ONLY_PER_KIND = 10
 OUTSIDE_PER_KIND = 13
 # One alarm in 300 is all that a target of 98 % by its bound allows: as many again stand behind the first ones.
 NULLS, MORE_NULLS = 300, 300
+# Of 100 pairs not even all would let a target of 97 % hold by its bound.
+PAIRS, MORE_PAIRS = 100, 200
 PAPER_PER_KIND = 16
 NEAR_REST = 0.3  # of the usual travel
 LISTS = tuple(LIST_OFFSET)
@@ -126,7 +128,7 @@ def tasks(group: str, seeds: str) -> list[Task]:
     first = FIRST_SEED[seeds] + LIST_OFFSET[group]
     kinds = list(_kinds(group, first))
     # Shuffled, so that the first few of a list are a fair sample of it; what was added later stands behind.
-    listed = len(kinds) - (MORE_NULLS if group == "nulls" else 0)
+    listed = len(kinds) - {"nulls": MORE_NULLS, "pairs": MORE_PAIRS}.get(group, 0)
     order = [*np.random.default_rng(first).permutation(listed), *range(listed, len(kinds))]
     alone, paper = group in ("motor_only", "paper"), group == "paper"
     return [Task(group, kinds[k], first + int(k), alone, near_rest=paper) for k in order]
@@ -139,7 +141,7 @@ def _kinds(group: str, first: int) -> Iterator[tuple[str, ...]]:
     elif group == "nulls":
         yield from [(NONE,)] * (NULLS + MORE_NULLS)
     elif group == "pairs":
-        yield from _pairs(100, np.random.default_rng(first))
+        yield from _pairs(PAIRS + MORE_PAIRS, np.random.default_rng(first))
     elif group == "motor_only":
         yield from ((k,) for k in (*MOTOR_ONLY, NONE, NONE) for _ in range(MOTOR_ONLY_PER_KIND))
     elif group == "outside":

@@ -22,9 +22,12 @@ from flexid_cli.config.load import parse_config
 from flexid_cli.config.schema import Config
 from flexid_cli.diagnose.diagnose import diagnose
 from flexid_cli.diagnose.result import Diagnosis
+from flexid_cli.effects.base import EffectValues
 from flexid_cli.readers.base import RawChannel, RawLog
 from flexid_cli.signals.build import recording_from_raw
 from flexid_cli.signals.recording import Recording, Segment
+from flexid_cli.simulate.engine import simulate_closed_loop
+from flexid_cli.simulate.machine import Axis, Controller
 
 SEED = FIRST_SEED["calibration"]
 LATER_NS = 1_700_000_000_000_000_000
@@ -86,6 +89,44 @@ def test_a_recording_on_which_the_model_does_not_hold_is_told():
     same = diagnose(recording, config, recording)
     assert not any("does not hold there" in note for note in same.notes)
     assert_holds(same, made)
+
+
+def limited(amplitude: float, like: Recording, seed: int) -> Recording:
+    """An axis whose drive gives no more than 60 N m, moved by so much of a usual trajectory."""
+    rng, rate = np.random.default_rng(seed), like.sample_rate_hz
+    t = np.arange(round(15.0 * rate)) / rate
+    waves = [0.3 / (1.0 + f) * np.sin(2.0 * np.pi * (f * t + rng.random())) for f in (0.3, 0.9, 2.1, 4.0)]
+    run = simulate_closed_loop(
+        Axis(
+            Jm=3.0, K=4000.0, JL=2.0, FVm=4.0, FSm=3.0, FV=2.0, FS=0.5, MX=0.0, MY=0.0,
+            reversal_velocity=0.004, load_reversal_velocity=0.01,
+        ),
+        Controller(15.0, 150.0, 300.0),
+        amplitude * np.sum(waves, axis=0),
+        rate,
+        effects=[EffectValues("torque_saturation", {"torque_limit": 60.0})],
+    )  # fmt: skip
+    noisy = (x + s * rng.standard_normal(t.size) for x, s in (
+        (run.torque, 0.1), (run.motor_position, 1e-7), (run.joint_position, 1e-7),
+    ))  # fmt: skip
+    return replace(like, segments=(Segment(0.0, *noisy),))
+
+
+def test_what_only_the_other_recording_shows_is_found_there():
+    """Motion within the drive's limit shows none; the recording for validation, of larger motion, does."""
+    made = case((NONE,), SEED + 100_000, seconds=(20.0, 25.0))
+    _, like = read(made)
+    plain = configuration(made)
+    plain["signals"]["motor_current"]["hold"] = "instant"  # told by the diagnosis itself
+    config = parse_config(yaml.safe_dump(plain), "limited")
+    small, large = limited(0.12, like, 1), limited(0.2, like, 2)
+    assert diagnose(small, config).verdict == "adequate"
+    found = diagnose(small, config, large)
+    assert found.verdict == "explained"
+    assert names(found) == {"torque_saturation"}
+    assert "Only the recording for validation" in found.sentence
+    assert any("holds nothing that the model lacks" in note for note in found.notes)
+    assert "Only the recording" not in diagnose(large, config, small).sentence
 
 
 slow = pytest.mark.slow
