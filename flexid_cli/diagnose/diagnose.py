@@ -83,7 +83,7 @@ def diagnose(
     selection = select(fitter, first_problems(validation, config, fitter, own.final.problem))
     other = _Report(fitter, selection, validation, config, recording, known or {})
     told = other.verdict in ("explained", "ambiguous") and other.holds_elsewhere()
-    return _exchanged(other.diagnosis()) if told else own.diagnosis()
+    return _exchanged(other.diagnosis()) if told else _doubtful(own.diagnosis())
 
 
 def forms_of(both: bool, *, linear: bool = False) -> list[Form]:
@@ -380,6 +380,14 @@ def _exchanged(diagnosis: Diagnosis) -> Diagnosis:
     )
     text = f"Only the recording for validation shows it. {diagnosis.sentence}"
     return replace(diagnosis, sentence=text, notes=(note, *diagnosis.notes))
+
+
+def _doubtful(diagnosis: Diagnosis) -> Diagnosis:
+    """A diagnosis that nothing contradicts but what the other recording leaves, which no effect explains there."""
+    note = (
+        "the other recording leaves more than its noise, and no effect that explains it explains this one too"
+    )
+    return replace(diagnosis, notes=(*diagnosis.notes, note))
 
 
 def _with_suggestion(text: str, place: Where | None, verdict: Verdict) -> str:

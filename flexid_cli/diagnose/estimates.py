@@ -78,6 +78,8 @@ def solved(fitted: Fitted) -> Solved:
     covariance[:p, :p] += np.outer(doubt, doubt) + floor
     if not problem.both and not problem.rigid:
         covariance = ALONE_SPREAD**2 * covariance
+        k = problem.names.index("K")
+        covariance[k, k] += _form_doubt(fitted)
     if problem.both:
         whole, covariance = _unscaled(fitted, whole, covariance, stiffened)
     return Solved(whole, covariance[:p, :p], robust.degrees_of_freedom[:p])
@@ -114,10 +116,18 @@ def _unscaled(
             G[k, fitted.columns(n)] = -fitted.slopes(n)
     out[k] -= fitted.stiffening
     covariance = G @ covariance @ G.T
-    for n, chosen in enumerate(fitted.chosen):
-        stiffness = float(fitted.amplitudes(n) @ fitted.slopes(n))
-        covariance[k, k] += (chosen.form.signature.form_doubt * stiffness) ** 2
+    covariance[k, k] += _form_doubt(fitted)
     return out, covariance
+
+
+def _form_doubt(fitted: Fitted) -> float:
+    """Variance of K from forms of effects that another member of the same family could have in their place."""
+    doubt = 0.0
+    for n, c in enumerate(fitted.chosen):
+        if share := c.form.signature.form_doubt:
+            slopes = fitted.slopes(n) if fitted.problem.both else fitted.problem.slopes(c.terms)
+            doubt += (share * float(fitted.amplitudes(n) @ slopes)) ** 2
+    return doubt
 
 
 def _bread(X: Array) -> Array:

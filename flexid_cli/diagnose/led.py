@@ -40,6 +40,7 @@ LEAST_DIFFERENCE, MOST_DIFFERENCE = 1e-5, 1e-2  # of the parameter
 JUMPS = (-0.15, -0.08, -0.04, 0.04, 0.08, 0.15)
 MOST_JUMPS, ABOVE_NOISE, WORTH_A_JUMP = 2, 1.15, 0.97
 MOST_CHANGE = 0.3  # of a parameter in one step; of a width's logarithm twice that
+SMALL_SHAPE = 0.05  # of a shape's range: what counts as its size where it is smaller
 WIDTHS = ("motor_reversal", "load_reversal")
 FRICTION = ("FVm", "FSm", "FV", "FS")
 TOLERANCE = 1e-8  # of the simulation's steps
@@ -298,6 +299,7 @@ class _Limits:
                 i += size
             for shape in fitted.search.shapes(c.form) or ():
                 low[i], high[i] = shape.low, shape.high
+                most[i] = MOST_CHANGE * max(abs(x[i]), SMALL_SHAPE * (shape.high - shape.low))
                 i += 1
         low[-2:] = np.log(1e-6)
         return cls(np.minimum(low, x), np.maximum(high, x), most)

@@ -552,6 +552,10 @@ class Problem:
         slopes = self._slopes(terms_of, seen) if slopes is None else slopes
         return self._without_spring(rows, slopes), slopes
 
+    def slopes(self, terms_of: Callable[[Motion], Terms]) -> Array:
+        """Stiffness of a transmission effect for unit amplitudes, shape (k,), whatever is measured."""
+        return self._slopes(terms_of, [terms_of(m) for m in self.motions])
+
     def _slopes(self, terms_of: Callable[[Motion], Terms], seen: Sequence[Terms]) -> Array:
         """Mean answer of a transmission effect to a little more torsion, shape (k,).
 

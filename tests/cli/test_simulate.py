@@ -121,7 +121,11 @@ def test_the_truth_that_is_written_gives_the_record_again(axis: Path, tmp_path: 
     truth = json.loads((tmp_path / "a.json").read_text())
     assert truth["axis"]["K"] == 2500.0
     assert truth["effects"]["backlash"] == {"gap": 0.001}
-    assert truth["effects"]["hysteresis"] == {"hysteresis_torque": 3.0, "hysteresis_length": 0.001}
+    assert truth["effects"]["hysteresis"] == {
+        "hysteresis_torque": 3.0,
+        "hysteresis_length": 0.001,
+        "hysteresis_exponent": 1.0,
+    }
     plain = tmp_path / "plain.yaml"
     plain.write_text(
         CONFIG.partition("  parameters:")[0] + "  trajectory:" + CONFIG.partition("  trajectory:")[2]

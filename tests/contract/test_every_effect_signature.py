@@ -44,6 +44,7 @@ SMALL: dict[tuple[str, int], tuple[tuple[float, ...], tuple[float, ...]]] = {
     ("hardening_stiffness", 0): ((), (3e5,)),
     ("hardening_stiffness", 1): ((2e-3,), (200.0,)),
     ("hysteresis", 0): ((1e-3,), (0.3,)),
+    ("hysteresis", 3): ((1e-3, 4.0), (0.3,)),
     # Few cycles: the columns leave out that the motor feels T A n cos(n qm + phi), small against K A. Without
     # a joint encoder K A hardly shows at low frequency, and what is left out is not small: see `sides_of_law`.
     ("transmission_error", 0): ((5.0,), (1e-4, 5e-5)),

@@ -83,6 +83,7 @@ def test_a_recording_on_which_the_model_does_not_hold_is_told():
     segments = tuple(replace(s, torque=1.3 * s.torque) for s in recording.segments)
     found = diagnose(recording, config, replace(recording, segments=segments))
     assert any("does not hold there" in note for note in found.notes)
+    assert any("leaves more than its noise" in note for note in found.notes)
     stiffness = estimate(found, "K")
     assert stiffness.verdict == "weak"
     assert "other recording" in stiffness.reason

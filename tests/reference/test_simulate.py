@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from flexid_cli.effects.base import EffectValues
+from flexid_cli.effects.transmission.hysteresis import _slip, _yielding
 from flexid_cli.errors import UsageError
 from flexid_cli.simulate.engine import simulate_closed_loop, simulate_motor_driven, simulate_torque_driven
 from flexid_cli.simulate.machine import ACCURATE, Axis, Controller, InitialState, Sensors, Solver
@@ -156,6 +157,29 @@ def test_dahl_loop_follows_its_formula():
         exact[i] = z
     assert worst(run.states["hysteresis.z"], exact) < 1e-6
     assert worst(run.joint_torque, BOLTED.K * d + exact) < 1e-6
+
+
+def test_an_element_that_yields_with_a_square_follows_its_formula():
+    """On its first way z' = (F / dh) (1 - (z / F)^2): z = F tanh(d / dh); in the simulation and in the columns."""
+    force, length = 15.0, 1e-3
+    d = np.linspace(0.0, 3e-3, 2000)
+    values = {"hysteresis_torque": force, "hysteresis_length": length, "hysteresis_exponent": 2.0}
+    run = simulate_motor_driven(
+        BOLTED, d, RATE, effects=(EffectValues("hysteresis", values),), initial=InitialState(0.0, 0.0)
+    )
+    exact = np.tanh(d / length)
+    assert worst(run.states["hysteresis.z"], force * exact) < 1e-6
+    state = np.zeros(d.size)
+    _yielding(d, length, 2.0, state)
+    assert worst(state, exact) < 1e-4
+
+
+def test_a_large_exponent_is_a_spring_that_slips():
+    d = torsion_wave(5e-3)
+    slider, state = np.zeros(d.size), np.zeros(d.size)
+    _slip(d, 1e-3, slider)
+    _yielding(d, 1e-3, 200.0, state)
+    assert np.std(state - slider) < 0.01 * np.std(slider)
 
 
 def advance(z: float, start: float, end: float, force: float, length: float) -> float:

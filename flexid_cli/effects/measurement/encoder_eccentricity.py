@@ -46,10 +46,8 @@ def _measurement(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
 
 def _centred(measured: Array, a: Array, cycles: float) -> Array:
     """The angle of which the wave makes the measured one: x + a sin(n x) = measured, which repetition solves."""
-    if (
-        float(np.hypot(*a)) * cycles > MOST_WAVE
-    ):  # no encoder's: the angle would all but stand still in places
-        return measured
+    if float(np.hypot(*a)) * cycles > MOST_WAVE:
+        return measured  # no encoder's wave: the measured angle would all but stand still in places
     angle = measured
     for _ in range(ROUNDS):
         before, angle = angle, measured - sines(angle, cycles) @ a
