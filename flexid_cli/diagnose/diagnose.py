@@ -349,7 +349,7 @@ class _Report:
         if stays := self._fails_elsewhere():
             notes.append(
                 f"on the other recording {stays:.2g} times the noise floor stays: what was fitted here does not hold"
-                " there"
+                " there (if it is the same axis, check signs and units of that log)"
             )
         if self.refuted:
             notes.append(f"{self.refuted} would explain this recording, but not the other one")

@@ -19,7 +19,9 @@ NEAR_RIVAL = 0.5  # of the best candidate's gain
 # Least gain (logarithm of the cost) of an effect, and what an alternative may be worse by. Calibrated, see
 # docs/diagnosis.md.
 ENOUGH = 0.12
-ENOUGH_ALONE = 0.15  # flexible, without a joint encoder: of the linear fit, which a simulation has to confirm
+ENOUGH_ALONE = (
+    0.15  # flexible, without a joint encoder: of the linear fit, which a simulation confirms where it can
+)
 ENOUGH_LED = 0.12  # of fits by simulation
 AS_GOOD = 0.05
 # Gain that the linear fit may have over its simulation, for noise in its columns makes it look better than it is.

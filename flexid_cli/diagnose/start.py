@@ -105,9 +105,14 @@ def first_problems(
 
 
 def _first_base(stretches: list[Stretch], width: float, both: bool, fitted: Problem | None) -> Base:
-    """A simple fit's parameters, or those of another record of the axis where this one alone shows none."""
+    """A simple fit's parameters, or with both encoders those of another record of the axis where this one has none.
+
+    With the motor alone a negative inertia has one cause: the sign or the unit of the torque.
+    """
+    if not both:
+        return _rigid_base(stretches, width)
     try:
-        return (_both_base if both else _rigid_base)(stretches, width)
+        return _both_base(stretches, width)
     except DataError:
         if fitted is None:
             raise
