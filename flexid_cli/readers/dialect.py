@@ -242,7 +242,13 @@ def _delimiter_and_decimal(lines: Sequence[str], options: Options) -> tuple[str,
     best, chosen = (-1.0, 0), (",", ".")
     body = lines[1:] or lines
     delimiters = (_chosen_delimiter(options.delimiter),) if options.delimiter else _DELIMITERS
+    absent_before = False
     for delimiter in delimiters:
+        # of those that stand in no line all tell the same, but the comma, which is no decimal mark beside itself
+        absent = delimiter != "," and not any(_is_in(delimiter, line) for line in body)
+        if absent and absent_before:
+            continue
+        absent_before |= absent
         rows = [split_line(line, delimiter) for line in body]
         width, often = Counter(map(len, rows)).most_common(1)[0]
         fitting = [row for row in rows if len(row) == width]
@@ -256,6 +262,10 @@ def _delimiter_and_decimal(lines: Sequence[str], options: Options) -> tuple[str,
             if score > best and (numbers or delimiter == delimiters[0]):
                 best, chosen = score, (delimiter, decimal)
     return chosen
+
+
+def _is_in(delimiter: str, line: str) -> bool:
+    return delimiter in line or (delimiter == WHITESPACE and "\t" in line)
 
 
 def _chosen_delimiter(text: str) -> str:

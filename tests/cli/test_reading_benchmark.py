@@ -54,3 +54,13 @@ def test_limits() -> None:
     assert "160 MB beside its arrays" in next(iter(reading.failures(fat, 1_000_000, 1.0)))
     slow = {("mcap_unchunked", "flexid"): [reading.Measured(0.7, 100.0, 10.0)]}
     assert "0.7 s for a million" in next(iter(reading.failures(slow, 1_000_000, 1.0)))
+
+
+def test_a_limit_is_missed_by_what_is_slow_by_itself() -> None:
+    other = [reading.Measured(1.0, 200.0, 100.0)] * 5
+    for times, missed in (([0.9, 3.0, 3.5, 2.8, 1.0], False), ([1.4, 3.0, 3.5, 2.8, 1.5], True)):
+        runs = [reading.Measured(one, 200.0, 100.0) for one in times]
+        found = list(reading.failures({("csv", "flexid"): runs, ("csv", "pandas"): other}, 100_000, 1.0))
+        assert [line for line in found if "pandas is" in line] == (
+            ["csv: flexid / pandas is 1.34, above 1.2"] if missed else []
+        )
