@@ -43,6 +43,7 @@ SHORTEST_S = 2.0
 MODEL_FLOOR = 0.001
 ASTRAY = 1.6
 BOTH_NAMES = ("Jm", "FVm", "FSm", "K", "c", "JL", "FV", "FS", "MX", "MY")
+ZERO_STEP = 0.01  # of the torsion's standard deviation, for the slope of what effects add to the spring
 SHARED = 1  # c, the spring's torque at its zero, stands in both equations
 SPRING_ALONE = 1e-3  # share of an effect of the transmission outside of a spring that can be anything
 PROBE_SEED, LEAST_PROBE = 20010523, 1e-4  # of the torsion's standard deviation
@@ -468,10 +469,22 @@ class Problem:
 
     def _base_both(self, s: Stretch, m: Motion) -> list[Complex]:
         known = s.both_spectra
-        one, gravity = known["one"], self.gravity * known["gravity"]
+        gravity = self.gravity * known["gravity"]
+        one = s.spectrum(self._local_stiffness(m) / self.stiffness) if self.passing else known["one"]
         motor = [known["motor"], s.spectrum(m.motor_sign), self._twist(s), one]
         load = [-one, known["joint"], s.spectrum(m.joint_sign), gravity]
         return self._side_by_side(np.hstack(motor), np.hstack(load))
+
+    def _local_stiffness(self, m: Motion) -> Array:
+        """Slope of the torque that the transmission passes on over the torsion: what a step of its zero moves."""
+        step = ZERO_STEP * float(np.std(m.deflection))
+        aside = [replace(m, deflection=m.deflection + way * step) for way in (0.5, -0.5)]
+        slope = np.full(m.deflection.size, self.base.K)
+        for columns, amplitudes in self.passing:
+            more, less = (columns(a).transmission for a in aside)
+            if more is not None and less is not None:
+                slope += (more - less) @ amplitudes / step
+        return slope
 
     @staticmethod
     def _side_by_side(M: Complex, L: Complex) -> list[Complex]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -241,3 +242,31 @@ def test_friction_that_grows_with_the_load_sees_all_that_the_transmission_passes
     motor = columns(passed, ()).motor
     assert motor is not None
     np.testing.assert_allclose(motor[:, 0], np.abs(passed.joint_torque) * passed.motor_sign)
+
+
+@pytest.mark.parametrize(("index", "shape", "share"), [(0, (), 0.4), (1, (0.5,), 0.7)])
+def test_a_step_of_the_springs_zero_moves_what_effects_add_to_it_too(search, index, shape, share):
+    # Without that, the zero goes where a torque offset draws it, and the curve of the spring with it.
+    hardening, p = form("hardening_stiffness", index), search.problem
+    size = p.scale().deflection
+    shape = tuple(x * size for x in shape)
+
+    def columns(m: Motion) -> Terms:
+        return hardening.signature.columns(m, shape)
+
+    amplitude = share * p.base.K / p.slopes(columns)
+    stiffening = share * p.base.K
+
+    def misfit(zero: float) -> np.ndarray:
+        q = p.at(replace(p.base, torsion_zero=zero), stiffening=stiffening, passing=[(columns, amplitude)])
+        rows, slopes = q.effect_rows(columns)
+        spring = q.base_rows()[:, q.names.index("K")] * (p.base.K + amplitude @ slopes)
+        return q.target() - spring - rows @ amplitude
+
+    step = 0.005 * size
+    now = p.at(p.base, stiffening=stiffening, passing=[(columns, amplitude)])
+    moved = (misfit(step) - misfit(-step)) / (2.0 * step)
+    column = now.base_rows()[:, now.names.index("c")] * now.stiffness
+    plain = p.base_rows()[:, p.names.index("c")] * now.stiffness
+    near, far = (np.linalg.norm(moved - one) / np.linalg.norm(moved) for one in (column, plain))
+    assert near < 0.15 * far, (near, far)
