@@ -14,6 +14,7 @@ from flexid_cli.diagnose.problem import Effects, Problem
 from flexid_cli.diagnose.reversals import sharpened
 from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
 from flexid_cli.diagnose.trust import trusted
+from flexid_cli.effects.base import Stage
 from flexid_cli.effects.motion import Base, Motion, Terms
 from flexid_cli.threads import side_by_side
 
@@ -338,9 +339,13 @@ def held(fitted: Fitted) -> Effects:
 
 
 def passing(fitted: Fitted) -> Effects:
-    """Those by which the transmission passes on more than its spring does."""
+    """Those that others come after: what the transmission passes on beside its spring, limits of the torque."""
     pairs = zip(fitted.chosen, held(fitted), strict=True)
-    return [pair for c, pair in pairs if c.form.effect.equation == "transmission"]
+    return [pair for c, pair in pairs if c.form.effect.equation == "transmission" or _limits(c)]
+
+
+def _limits(chosen: Chosen) -> bool:
+    return any(law.stage is Stage.LIMIT for law in chosen.form.effect.laws)
 
 
 def _gravity(fitted: Fitted) -> tuple[Callable[[Motion], Terms], Array]:

@@ -224,7 +224,8 @@ class Problem:
     trust : sequence of ndarray, optional
         Further weight of each row, shape (equations, rows), by stretch.
     passing : sequence of pairs, optional
-        Effects of the model by which the transmission passes on more than its spring does.
+        Effects of the model that others come after: by which the transmission passes on more than its spring does,
+        and limits of the torque.
     """
 
     def __init__(
@@ -257,13 +258,15 @@ class Problem:
         self.recorded = stretches
         self.rigid, self.led = rigid, led
         self.names = BOTH_NAMES if both else RIGID_NAMES if rigid else ALONE_NAMES
-        self.torque_rms = float(np.sqrt(np.mean(np.concatenate([s.torque for s in stretches]) ** 2)))
+        self.motions = [self.motion(s) for s in stretches]
+        # A controller that winds up asks for a thousand times what a limit lets through.
+        acting = np.concatenate([m.limited_torque for m in self.motions])
+        self.torque_rms = float(np.sqrt(np.mean(acting**2)))
         self.trust = trust
         each = trust if trust is not None else [None] * len(stretches)
         self.weights = [Weights(s.taper, self.spectral(s), t) for s, t in zip(stretches, each, strict=True)]
         # Eq. (18) is 1 + X2 s + X1 s^2 times the torque: the likelihood is that of the torque.
         self.level = float(np.mean([w.level - self._passing(w) for w in self.weights]))
-        self.motions = [self.motion(s) for s in stretches]
 
     def at(
         self,
@@ -376,6 +379,7 @@ class Problem:
         motion = Motion(
             time_s=s.time_s,
             torque=s.torque,
+            limited_torque=s.torque,
             motor_position=s.motor_smooth,
             motor_velocity=s.motor_velocity if s.sharpener is None else s.motor_sharp,
             joint_position=joint,
@@ -393,11 +397,14 @@ class Problem:
             joint_encoder=self.both,
             duration_s=self.duration_s,
         )
-        passed = motion.joint_torque
+        passed, limited = motion.joint_torque, motion.torque
         for columns, amplitudes in self.passing:
-            more = columns(motion).transmission
-            passed = passed if more is None else passed + more @ amplitudes
-        return replace(motion, joint_torque=passed)
+            terms = columns(motion)
+            if terms.transmission is not None:
+                passed = passed + terms.transmission @ amplitudes
+            if terms.motor is not None:
+                limited = limited - terms.motor @ amplitudes
+        return replace(motion, joint_torque=passed, limited_torque=limited)
 
     def led_position(self, s: Stretch) -> Array:
         """Where the load goes when the motor moves as measured: no noise of the torque is in it, and no effect."""

@@ -49,6 +49,8 @@ class Motion:
         From the start of the record.
     torque : ndarray
         Recorded motor torque.
+    limited_torque : ndarray
+        What is left of it by a limit that the model has.
     motor_position, motor_velocity, joint_position, joint_velocity, joint_acceleration : ndarray
         Low-passed; without a joint encoder the joint's are rebuilt from eq. (14).
     motor_sign, joint_sign : ndarray
@@ -73,6 +75,7 @@ class Motion:
 
     time_s: Array
     torque: Array
+    limited_torque: Array
     motor_position: Array
     motor_velocity: Array
     joint_position: Array

@@ -11,7 +11,7 @@ import pytest
 from flexid_cli.diagnose.basis import Basis, solve
 from flexid_cli.diagnose.problem import Problem, Stretch
 from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
-from flexid_cli.effects.forms import LEAST_PERIODS
+from flexid_cli.effects.forms import LEAST_PERIODS, lagged
 from flexid_cli.effects.motion import Base, Motion, Terms
 from flexid_cli.effects.registry import effect, effects
 from flexid_cli.estimate.budget import NoiseLevels
@@ -270,3 +270,25 @@ def test_a_step_of_the_springs_zero_moves_what_effects_add_to_it_too(search, ind
     plain = p.base_rows()[:, p.names.index("c")] * now.stiffness
     near, far = (np.linalg.norm(moved - one) / np.linalg.norm(moved) for one in (column, plain))
     assert near < 0.15 * far, (near, far)
+
+
+def test_a_lag_sees_the_torque_that_a_limit_lets_through_and_the_floor_too(search):
+    limit, lag, p = form("torque_saturation"), form("actuator_lag"), search.problem
+    windup = np.where(
+        np.abs(p.stretches[0].torque) > 1.0, 1000.0, 1.0
+    )  # what a controller asks for meanwhile
+    segment = replace(p.stretches[0].segment, torque=windup * p.stretches[0].torque)
+    asked = p.at(p.base, stretches=[p.stretches[0].like(segment)])
+    height = 1.0
+
+    def columns(m: Motion) -> Terms:
+        return limit.signature.columns(m, (height,))
+
+    limited = asked.at(p.base, passing=[(columns, np.ones(1))])
+    (motion,) = limited.motions
+    acting = np.clip(motion.torque, -height, height)
+    parts = [columns(motion).motor, lag.signature.columns(motion, (0.01,)).motor]
+    expected = lagged(acting, 0.01, motion.period_s)
+    np.testing.assert_allclose(motion.torque - sum(x[:, 0] for x in parts), expected, atol=1e-9)
+    assert asked.torque_rms > 100.0 * limited.torque_rms
+    assert limited.torque_rms == pytest.approx(np.sqrt(np.mean(acting**2)))

@@ -48,7 +48,7 @@ def _command(torque: Array, rate_hz: float, values: Mapping[str, float]) -> Arra
 
 
 def _columns(m: Motion, shape: Sequence[float]) -> Terms:
-    return Terms(motor=column(m.torque - lagged(m.torque, shape[0], m.period_s)))
+    return Terms(motor=column(m.limited_torque - lagged(m.limited_torque, shape[0], m.period_s)))
 
 
 def _shapes(scale: Scale) -> Sequence[Shape]:
