@@ -120,21 +120,27 @@ def _first_base(stretches: list[Stretch], width: float, both: bool, fitted: Prob
 
 
 def _both_base(stretches: list[Stretch], width: float) -> Base:
-    """Motor equation and load equation, each by plain least squares in the smooth band."""
+    """Motor equation and load equation, each by plain least squares in the smooth band.
+
+    Where that makes no axis, with what turns torque and torsion the most: a lag of the torque, damping in the joint.
+    """
     motor, load = [], []
     for s in stretches:
         torsion, one = s.motor_smooth - s.joint_smooth, np.ones(s.torque.size)
         velocity = s.derivative(s.joint_smooth, 1)
+        torque = s.lowpass(s.torque, SMOOTH_BAND)
         cut = slice(50, -50)
         motor.append(
             np.column_stack(
                 [
-                    s.lowpass(s.torque, SMOOTH_BAND),
+                    torque,
                     s.derivative(s.motor_smooth, 2),
                     torsion,
                     s.motor_velocity,
                     np.tanh(s.motor_velocity / width),
                     one,
+                    s.derivative(torque, 1),
+                    s.motor_velocity - velocity,
                 ]
             )[cut]
         )
@@ -149,13 +155,17 @@ def _both_base(stretches: list[Stretch], width: float) -> Base:
                     one,
                     np.cos(s.joint_smooth),
                     np.sin(s.joint_smooth),
+                    s.motor_velocity - velocity,
                 ]
             )[cut]
         )
     M, L = np.vstack(motor), np.vstack(load)
-    Jm, K, FVm, FSm, _ = solve(M[:, 1:], M[:, 0]).coefficients
-    inertia, viscous, coulomb, zero, *_ = solve(L[:, 1:], L[:, 0]).coefficients
-    if not (Jm > 0.0 and K > 0.0 and inertia > 0.0):
+    for m, x in ((M[:, :-2], L[:, :-1]), (M, L)):
+        Jm, K, FVm, FSm, *_ = solve(m[:, 1:], m[:, 0]).coefficients
+        inertia, viscous, coulomb, zero, *_ = solve(x[:, 1:], x[:, 0]).coefficients
+        if Jm > 0.0 and K > 0.0 and inertia > 0.0:
+            break
+    else:
         raise DataError(
             "the motor and joint positions do not show a flexible axis: inertia or stiffness come out negative",
             "check the signs and units of torque and positions with `flexid identify`, and excite the axis around its"
