@@ -15,6 +15,7 @@ from flexid_cli.diagnose.reversals import motor_sharpened
 from flexid_cli.diagnose.rows import motor_only_noise, two_encoder_noise
 from flexid_cli.diagnose.torque_noise import ABOVE, HIGHEST, MOST_FALL, torque_noise
 from flexid_cli.diagnose.trust import trusted
+from flexid_cli.effects.forms import lagged
 from flexid_cli.effects.motion import Base
 from flexid_cli.errors import DataError
 from flexid_cli.estimate.band import torque_band, usable_band
@@ -36,6 +37,15 @@ MOST_STARTS = 6
 RIGID = 100.0  # times the band: a resonance that is nowhere in it
 SCANNED_WITH = ("torque_offset", "gravity", "joint_damping", "load_dependent_friction", "viscous_nonlinear")
 LEAST_LINES = 8  # of a spectrum, to read the torque's noise from
+LAGS = (
+    0.5,
+    1.0,
+    2.0,
+    4.0,
+    8.0,
+    16.0,
+    32.0,
+)  # of the torque, sampling periods, where plain least squares fail
 SCAN_LOW = 8.0  # lowest locked-motor frequency looked at, cycles in the record
 
 
@@ -122,59 +132,53 @@ def _first_base(stretches: list[Stretch], width: float, both: bool, fitted: Prob
 def _both_base(stretches: list[Stretch], width: float) -> Base:
     """Motor equation and load equation, each by plain least squares in the smooth band.
 
-    Where that makes no axis, with what turns torque and torsion the most: a lag of the torque, damping in the joint.
+    Where that makes no axis, with what turns torque and torsion the most: damping in the joint, a lag of the torque.
     """
-    motor, load = [], []
-    for s in stretches:
-        torsion, one = s.motor_smooth - s.joint_smooth, np.ones(s.torque.size)
-        velocity = s.derivative(s.joint_smooth, 1)
-        torque = s.lowpass(s.torque, SMOOTH_BAND)
-        cut = slice(50, -50)
-        motor.append(
-            np.column_stack(
-                [
-                    torque,
-                    s.derivative(s.motor_smooth, 2),
-                    torsion,
-                    s.motor_velocity,
-                    np.tanh(s.motor_velocity / width),
-                    one,
-                    s.derivative(torque, 1),
-                    s.motor_velocity - velocity,
-                ]
-            )[cut]
-        )
-        # Torsion explained by the load's motion: the other way round noise would draw K to zero.
-        load.append(
-            np.column_stack(
-                [
-                    torsion,
-                    s.derivative(s.joint_smooth, 2),
-                    velocity,
-                    np.tanh(velocity / width),
-                    one,
-                    np.cos(s.joint_smooth),
-                    np.sin(s.joint_smooth),
-                    s.motor_velocity - velocity,
-                ]
-            )[cut]
-        )
-    M, L = np.vstack(motor), np.vstack(load)
-    for m, x in ((M[:, :-2], L[:, :-1]), (M, L)):
-        Jm, K, FVm, FSm, *_ = solve(m[:, 1:], m[:, 0]).coefficients
-        inertia, viscous, coulomb, zero, *_ = solve(x[:, 1:], x[:, 0]).coefficients
-        if Jm > 0.0 and K > 0.0 and inertia > 0.0:
-            break
-    else:
+    found = _plain_base(stretches, width)
+    if found is None:
+        tried = (_plain_base(stretches, width, lag) for lag in LAGS)
+        found = min((one for one in tried if one is not None), key=lambda one: one[0], default=None)
+    if found is None:
         raise DataError(
             "the motor and joint positions do not show a flexible axis: inertia or stiffness come out negative",
             "check the signs and units of torque and positions with `flexid identify`, and excite the axis around its"
             " first resonance",
         )
-    return Base(
+    return found[1]
+
+
+def _plain_base(
+    stretches: list[Stretch], width: float, lag: float | None = None
+) -> tuple[float, Base] | None:
+    """What the motor equation leaves of the torque, as a share, and the base; None where that is no axis.
+
+    With a ``lag`` of the torque (sampling periods) the joint is damped.
+    """
+    motor, load = [], []
+    for s in stretches:
+        torque = s.torque if lag is None else lagged(s.torque, lag, 1.0)
+        joint = s.derivative(s.joint_smooth, 1)
+        torsion, one = s.motor_smooth - s.joint_smooth, np.ones(s.torque.size)
+        damped = [] if lag is None else [s.motor_velocity - joint]
+        acceleration = s.derivative(s.motor_smooth, 2)
+        sign = np.tanh(s.motor_velocity / width)
+        spring = [torsion, s.motor_velocity, sign, one, *damped]
+        motor.append(np.column_stack([s.lowpass(torque, SMOOTH_BAND), acceleration, *spring])[50:-50])
+        # Torsion explained by the load's motion: the other way round noise would draw K to zero.
+        moved = [s.derivative(s.joint_smooth, 2), joint, np.tanh(joint / width)]
+        gravity = [np.cos(s.joint_smooth), np.sin(s.joint_smooth)]
+        load.append(np.column_stack([torsion, *moved, one, *gravity, *damped])[50:-50])
+    M, L = np.vstack(motor), np.vstack(load)
+    fit = solve(M[:, 1:], M[:, 0])
+    Jm, K, FVm, FSm, *_ = fit.coefficients
+    inertia, viscous, coulomb, zero, *_ = solve(L[:, 1:], L[:, 0]).coefficients
+    if not (Jm > 0.0 and K > 0.0 and inertia > 0.0):
+        return None
+    base = Base(
         Jm=float(Jm), K=float(K), JL=float(K * inertia), FVm=float(FVm), FSm=float(FSm), FV=float(K * viscous),
         FS=float(K * coulomb), motor_reversal=width, load_reversal=width, torsion_zero=float(zero),
     )  # fmt: skip
+    return fit.cost / float(M[:, 0] @ M[:, 0]), base
 
 
 def _rigid_base(stretches: list[Stretch], width: float) -> Base:

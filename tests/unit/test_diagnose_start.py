@@ -37,10 +37,10 @@ def test_a_simple_fit_finds_a_linear_axis():
     assert [base.Jm, base.K, base.JL] == pytest.approx([Jm, K, JL], rel=1e-3)
 
 
-@pytest.mark.parametrize(("lag", "damping"), [(0.012, 0.0), (0.012, 20.0), (0.02, 10.0)])
+@pytest.mark.parametrize(("lag", "damping"), [(0.016, 60.0), (0.02, 60.0), (0.032, 60.0)])
 def test_a_lag_that_turns_the_torque_does_not_hide_the_axis(lag, damping):
     base = _first_base([stretch(lag=lag, damping=damping)], 0.01, True, None)
-    assert [base.Jm, base.K, base.JL] == pytest.approx([Jm, K, JL], rel=0.5)
+    assert [base.Jm, base.K, base.JL] == pytest.approx([Jm, K, JL], rel=0.3)
 
 
 def test_a_torque_of_the_wrong_sign_shows_no_axis():
