@@ -389,6 +389,8 @@ class Problem:
             joint_sign=joint_sign,
             deflection=deflection,
             deflection_rate=s.motor_velocity - velocity,
+            torsion=deflection,
+            torsion_rate=s.motor_velocity - velocity,
             joint_torque=base.K * deflection,
             period_s=s.period_s,
             base=base,
@@ -397,6 +399,20 @@ class Problem:
             joint_encoder=self.both,
             duration_s=self.duration_s,
         )
+        return self._with_effects(motion, s) if self.passing else motion
+
+    def _with_effects(self, motion: Motion, s: Stretch) -> Motion:
+        """The motion as effects see it that come after others of the model: kinematics, then torques."""
+        twist = np.zeros(motion.time_s.size)
+        for columns, amplitudes in self.passing:
+            more = columns(motion).torsion
+            twist = twist if more is None else twist + more @ amplitudes
+        if twist.any():
+            motion = replace(
+                motion,
+                torsion=motion.torsion + twist,
+                torsion_rate=motion.torsion_rate + s.derivative(twist, 1),
+            )
         passed, limited = motion.joint_torque, motion.torque
         for columns, amplitudes in self.passing:
             terms = columns(motion)
@@ -485,7 +501,7 @@ class Problem:
     def _local_stiffness(self, m: Motion) -> Array:
         """Slope of the torque that the transmission passes on over the torsion: what a step of its zero moves."""
         step = ZERO_STEP * float(np.std(m.deflection))
-        aside = [replace(m, deflection=m.deflection + way * step) for way in (0.5, -0.5)]
+        aside = [replace(m, torsion=m.torsion + way * step) for way in (0.5, -0.5)]
         slope = np.full(m.deflection.size, self.base.K)
         for columns, amplitudes in self.passing:
             more, less = (columns(a).transmission for a in aside)
@@ -601,7 +617,8 @@ class Problem:
             moved = replace(
                 m,
                 deflection=m.deflection + probe,
-                deflection_rate=m.deflection_rate + s.derivative(probe, 1),
+                torsion=m.torsion + probe,
+                torsion_rate=m.torsion_rate + s.derivative(probe, 1),
             )
             out.append((probe, moved))
         return out

@@ -56,7 +56,9 @@ class Motion:
     motor_sign, joint_sign : ndarray
         sgn of the velocities with the baseline's reversal width.
     deflection, deflection_rate : ndarray
-        Torsion of the spring, without its zero, and its rate.
+        Difference of the positions, without the spring's zero, and its rate.
+    torsion, torsion_rate : ndarray
+        The same with what the transmission's kinematics add, by the effects that the model has: what the spring sees.
     joint_torque : ndarray
         Torque that the transmission passes on: its spring's, and that of the effects that the model has there.
     period_s : float
@@ -85,6 +87,8 @@ class Motion:
     joint_sign: Array
     deflection: Array
     deflection_rate: Array
+    torsion: Array
+    torsion_rate: Array
     joint_torque: Array
     period_s: float
     base: Base
@@ -104,12 +108,16 @@ class Terms:
         Torque that resists the motor, the load.
     transmission : ndarray or None
         Torque that the transmission passes on beside K (qm - q).
+    torsion : ndarray or None
+        What an error of the transmission's kinematics adds to the torsion; its spring's torque stands in
+        ``transmission``.
     motor_error, joint_error : ndarray or None
         What a position's measurement is too large by.
     """
 
     motor: Array | None = None
     transmission: Array | None = None
+    torsion: Array | None = None
     load: Array | None = None
     motor_error: Array | None = None
     joint_error: Array | None = None

@@ -292,3 +292,20 @@ def test_a_lag_sees_the_torque_that_a_limit_lets_through_and_the_floor_too(searc
     np.testing.assert_allclose(motion.torque - sum(x[:, 0] for x in parts), expected, atol=1e-9)
     assert asked.torque_rms > 100.0 * limited.torque_rms
     assert limited.torque_rms == pytest.approx(np.sqrt(np.mean(acting**2)))
+
+
+def test_play_and_damping_see_the_transmissions_error_of_the_model(search):
+    error, p, cycles, size = form("transmission_error"), search.problem, 30.0, 2e-3
+
+    def columns(m: Motion) -> Terms:
+        return error.signature.columns(m, (cycles,))
+
+    (plain,) = p.motions
+    (motion,) = p.at(p.base, passing=[(columns, np.array([0.0, size]))]).motions
+    angle = cycles * motion.motor_position
+    np.testing.assert_allclose(motion.torsion, plain.torsion + size * np.sin(angle), atol=1e-12)
+    rate = plain.torsion_rate + size * cycles * np.cos(angle) * plain.motor_velocity
+    inner = slice(50, -50)
+    np.testing.assert_allclose(motion.torsion_rate[inner], rate[inner], atol=1e-3 * np.abs(rate).max())
+    np.testing.assert_allclose(motion.joint_torque, p.base.K * motion.torsion, rtol=1e-9, atol=1e-6)
+    np.testing.assert_array_equal(motion.deflection, plain.deflection)

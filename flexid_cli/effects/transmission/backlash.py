@@ -56,7 +56,7 @@ INNER_STIFFNESS = 0.35  # over the outer one: stiffer than that inside the gap, 
 
 def _columns(m: Motion, shape: Sequence[float]) -> Terms:
     half = 0.5 * shape[0]
-    return Terms(transmission=column(-np.clip(m.deflection - shape[1], -half, half)))
+    return Terms(transmission=column(-np.clip(m.torsion - shape[1], -half, half)))
 
 
 def _shapes(scale: Scale) -> Sequence[Shape]:

@@ -51,7 +51,7 @@ def _torque(w: Array, p: Array, _x: Array, _dx: Array, g: Array) -> None:
 
 
 def _cubic(m: Motion, _: Sequence[float]) -> Terms:
-    return Terms(transmission=column(m.deflection**3))
+    return Terms(transmission=column(m.torsion**3))
 
 
 def _cubic_values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
@@ -59,7 +59,7 @@ def _cubic_values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:
 
 
 def _knee(m: Motion, shape: Sequence[float]) -> Terms:
-    return Terms(transmission=column(m.deflection - np.clip(m.deflection, -shape[0], shape[0])))
+    return Terms(transmission=column(m.torsion - np.clip(m.torsion, -shape[0], shape[0])))
 
 
 def _knees(scale: Scale) -> Sequence[Shape]:

@@ -94,27 +94,27 @@ def _yielding(torsion: Array, length: float, exponent: float, out: Array) -> Non
 
 
 def _dahl_columns(m: Motion, shape: Sequence[float]) -> Terms:
-    state = np.zeros(m.deflection.size)
-    _dahl(m.deflection, shape[0], state)
+    state = np.zeros(m.torsion.size)
+    _dahl(m.torsion, shape[0], state)
     return Terms(transmission=column(state))
 
 
 def _slip_columns(m: Motion, shape: Sequence[float]) -> Terms:
-    state = np.zeros(m.deflection.size)
-    _slip(m.deflection, shape[0], state)
+    state = np.zeros(m.torsion.size)
+    _slip(m.torsion, shape[0], state)
     return Terms(transmission=column(state))
 
 
 def _sliders_columns(m: Motion, shape: Sequence[float]) -> Terms:
-    states = np.zeros((len(LENGTHS), m.deflection.size))
+    states = np.zeros((len(LENGTHS), m.torsion.size))
     for length, state in zip(LENGTHS, states, strict=True):
-        _slip(m.deflection, length * shape[0], state)
+        _slip(m.torsion, length * shape[0], state)
     return Terms(transmission=states.T)
 
 
 def _yielding_columns(m: Motion, shape: Sequence[float]) -> Terms:
-    state = np.zeros(m.deflection.size)
-    _yielding(m.deflection, shape[0], shape[1], state)
+    state = np.zeros(m.torsion.size)
+    _yielding(m.torsion, shape[0], shape[1], state)
     return Terms(transmission=column(state))
 
 

@@ -38,7 +38,7 @@ def _torque(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
 
 
 def _columns(m: Motion, _: Sequence[float]) -> Terms:
-    return Terms(transmission=column(m.deflection_rate))
+    return Terms(transmission=column(m.torsion_rate))
 
 
 def _values(a: Array, _: Sequence[float], __: Base) -> dict[str, float]:

@@ -42,7 +42,8 @@ def _kinematics(w: Array, p: Array, _x: Array, _dx: Array, _g: Array) -> None:
 
 
 def _columns(m: Motion, shape: Sequence[float]) -> Terms:
-    return Terms(transmission=m.base.K * sines(m.motor_position, shape[0]))
+    error = sines(m.motor_position, shape[0])
+    return Terms(transmission=m.base.K * error, torsion=error)
 
 
 def _shapes(scale: Scale) -> Sequence[Shape] | None:
