@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +84,7 @@ def select(fitter: Fitter, problems: Sequence[Problem]) -> Selection:
 
 def _grown(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
     """The model with the effects that the record holds."""
-    enough, seen = threshold(fitted.problem), {_names(fitted)}
+    enough, seen, before = threshold(fitted.problem), {_names(fitted)}, fitted
     while len(fitted.chosen) < MOST_EFFECTS:
         trials = _added(fitter, fitted, found)
         if not trials or trials[0].gain(fitted) < enough:
@@ -96,14 +96,28 @@ def _grown(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
         fitted = grown
         seen.add(_names(fitted))
         found = fitter.candidates(fitted)
-    return _settled(fitter, fitted)
+    return fitted if fitted is before else _settled(fitter, fitted)
 
 
 def _settled(fitter: Fitter, fitted: Fitted) -> Fitted:
     """The fit where shapes and reversals no longer move: one that was far off has drawn the others along."""
+    return _until_still(fitted, lambda f: fitter.reweighted(fitter.relax(f.problem, f.chosen)))
+
+
+def _settled_led(fitter: Fitter, fitted: Fitted) -> Fitted:
+    """The fit by simulation where further steps, from reversals told anew, no longer help.
+
+    Gaps that open and signs that turn make the residual rough: steps get caught.
+    """
+    return _until_still(
+        fitted, lambda f: refined(fitter, f) if isinstance(f, LedFit) and not f.is_noise else None
+    )
+
+
+def _until_still(fitted: Fitted, again: Callable[[Fitted], Fitted | None]) -> Fitted:
     for _ in range(MOST_ROUNDS):
-        moved = fitter.reweighted(fitter.relax(fitted.problem, fitted.chosen))
-        if moved.loss > fitted.loss - STILL:
+        moved = again(fitted)
+        if moved is None or moved.loss > fitted.loss - STILL:
             break
         fitted = moved
     return fitted
@@ -137,6 +151,10 @@ def _grown_led(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted
         new = min(simulated, key=lambda f: f.loss, default=None)
         if new is None or new.gain(fitted) < ENOUGH_LED:
             break
+        other = _reshaped(fitter, fitted)
+        if other is not fitted and new.gain(other) < ENOUGH_LED:
+            fitted = other
+            break
         grown = _confirmed(fitter, new) if len(new.chosen) > 1 else new
         if _names(grown) in seen:
             fitted = _better(fitted, grown)
@@ -147,19 +165,18 @@ def _grown_led(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted
     return _settled_led(fitter, fitted)
 
 
-def _settled_led(fitter: Fitter, fitted: Fitted) -> Fitted:
-    """The fit by simulation where further steps, from reversals told anew, no longer help.
+def _reshaped(fitter: Fitter, fitted: Fitted) -> Fitted:
+    """The same effects with curved frictions from other starts, if that is better: before a further one is named.
 
-    Gaps that open and signs that turn make the residual rough: steps get caught.
+    The shape at which a linear fit proposed it stands in for what else it lacked.
     """
-    for _ in range(MOST_ROUNDS):
-        if not isinstance(fitted, LedFit) or fitted.is_noise:
-            break
-        moved = refined(fitter, fitted)
-        if moved is None or moved.loss > fitted.loss - STILL:
-            break
-        fitted = moved
-    return fitted
+    best = fitted
+    for k, c in enumerate(fitted.chosen):
+        starts = [s for s in _curves(fitter, fitted, c.form.name) if c.form.signature.curved]
+        models = [(*fitted.chosen[:k], s, *fitted.chosen[k + 1 :]) for s in starts]
+        simulated = [s for f in fitter.relaxed(fitted, models) if (s := _simulated(fitter, f))]
+        best = min([best, *simulated], key=lambda f: f.loss)
+    return best
 
 
 def _simulated(fitter: Fitter, fitted: Fitted) -> Fitted | None:
@@ -239,14 +256,14 @@ def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> list[Fitte
     rivals = [c for c in possible if c.gain > NEAR_RIVAL * possible[0].gain][:RIVALS]
     starts = [Chosen(c.form, c.shape) for c in rivals]
     if fitted.problem.both:
-        starts += [s for c in rivals for s in _curves(fitter, fitted, c)]
+        starts += [s for c in rivals for s in _curves(fitter, fitted, c.form.name)]
     trials = fitter.relaxed(fitted, [(*fitted.chosen, s) for s in starts])
     return sorted(trials, key=lambda f: f.loss)
 
 
-def _curves(fitter: Fitter, fitted: Fitted, c: Candidate) -> list[Chosen]:
+def _curves(fitter: Fitter, fitted: Fitted, name: str) -> list[Chosen]:
     """Other starts for a friction: the reversal's width, fitted without it, has taken the place of a part of it."""
-    forms = [f for f in fitter.forms if f.name == c.form.name and f.signature.curved]
+    forms = [f for f in fitter.forms if f.name == name and f.signature.curved]
     return [Chosen(f, shape) for f in forms for shape in fitted.search.spread(f, CURVES)]
 
 
@@ -266,20 +283,32 @@ def _alternatives(
 ) -> tuple[Fitted, tuple[tuple[Fitted, ...], ...], tuple[tuple[tuple[str, float], ...], ...]]:
     """The model, and what explains the record as well in place of each chosen effect.
 
-    With the motor alone, another effect can be the better one once it is simulated: then it is the model's.
+    With the motor alone, another effect can be the better one once it is simulated: then it is the model's. And
+    where the best of them leaves more than noise, what is missing in it is as large as that: effects that are worse
+    by no more are not excluded.
     """
     alone = not (fitted.problem.both or fitted.problem.rigid)
     alternatives, rivals = [], []
     for k in range(len(fitted.chosen)):
-        refits, worse = _others(fitter, fitted, k, WORTH_A_SIMULATION if alone else AS_GOOD)
+        refits, worse = _others(
+            fitter, fitted, k, max(WORTH_A_SIMULATION, _missing(fitted)) if alone else AS_GOOD
+        )
         if alone:
             refits = [s for f in refits if (s := _simulated(fitter, f))]
         if alone and len(fitted.chosen) == 1 and refits:
             own = [] if _denied(fitted) else [fitted]
             fitted, *refits = sorted([*own, *refits], key=lambda f: f.loss)
-        alternatives.append(tuple(f for f in refits if f.loss - fitted.loss < AS_GOOD))
+        near = max(AS_GOOD, _missing(fitted)) if alone else AS_GOOD
+        alternatives.append(tuple(f for f in refits if f.loss - fitted.loss < near))
         rivals.append(tuple(sorted(worse, key=lambda w: w[1])))
     return fitted, tuple(alternatives), tuple(rivals)
+
+
+def _missing(fitted: Fitted) -> float:
+    """Loss of a fit by simulation above that of noise."""
+    if not isinstance(fitted, LedFit) or fitted.is_noise:
+        return 0.0
+    return float(np.log(fitted.cost / fitted.y.size))
 
 
 def _others(

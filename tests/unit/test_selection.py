@@ -10,6 +10,7 @@ import pytest
 
 from flexid_cli.diagnose import selection
 from flexid_cli.diagnose.fitter import Fitter as RecordFitter
+from flexid_cli.diagnose.led import LedFit
 from flexid_cli.diagnose.problem import Problem, Stretch
 from flexid_cli.diagnose.search import Form
 from flexid_cli.effects.base import EffectValues
@@ -134,3 +135,41 @@ def test_a_flat_friction_is_found_although_a_wide_reversal_has_taken_its_place()
     assert [c.name for c in found.chosen] == ["viscous_nonlinear"]
     assert found.chosen[0].shape[0] == pytest.approx(0.5, abs=0.1)
     assert found.basis.rms < 1.3
+
+
+def test_a_further_effect_is_not_named_where_the_friction_of_the_model_had_the_wrong_shape(monkeypatch):
+    friction, curved, both = (
+        Model("friction", loss=1.0),
+        Model("friction", loss=0.1),
+        Model("friction", "other"),
+    )
+    for model in (friction, curved, both):
+        monkeypatch.setattr(model, "gain", lambda other, m=model: other.loss - m.loss, raising=False)
+    monkeypatch.setattr(selection, "_added", lambda *_: [both])
+    monkeypatch.setattr(selection, "_simulated", lambda _, f: f)
+    monkeypatch.setattr(selection, "_confirmed", lambda _, f: f)
+    for found, expected in ((curved, ["friction"]), (friction, ["friction", "other"])):
+        monkeypatch.setattr(selection, "_reshaped", lambda *_, f=found: f)
+        assert names(selection._grown_led(Fitter(), friction, [])) == expected
+
+
+@pytest.mark.parametrize(("rms", "excluded"), [(1.0, True), (1.6, False)])
+def test_what_a_model_misses_is_no_ground_to_exclude_another(monkeypatch, rms, excluded):
+    def led(name: str, loss: float) -> LedFit:
+        model = object.__new__(LedFit)
+        values = {
+            "chosen": (SimpleNamespace(name=name),),
+            "y": np.zeros(100),
+            "problem": SimpleNamespace(both=False),
+        }
+        for field, value in {**values, "basis": SimpleNamespace(cost=100.0 * rms**2)}.items():
+            object.__setattr__(model, field, value)
+        model.__dict__["loss"] = loss
+        model.problem.rigid, model.problem.level = False, loss - np.log(100.0 * rms**2)
+        return model
+
+    other = led("other", 0.5)
+    monkeypatch.setattr(selection, "_others", lambda *_: ([other], [("other", 0.5)]))
+    monkeypatch.setattr(selection, "_simulated", lambda _, f: f)
+    _, (alternatives,), _ = selection._alternatives(Fitter(), led("named", 0.0))
+    assert (alternatives == ()) == excluded
