@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import Basis, solve
-from flexid_cli.diagnose.problem import Effects, Problem
+from flexid_cli.diagnose.problem import Effects, Joined, Problem
 from flexid_cli.diagnose.reversals import sharpened
 from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
 from flexid_cli.diagnose.trust import trusted
@@ -338,10 +338,14 @@ def held(fitted: Fitted) -> Effects:
     return [(c.terms, fitted.amplitudes(k)) for k, c in enumerate(fitted.chosen)]
 
 
-def passing(fitted: Fitted) -> Effects:
+def passing(fitted: Fitted) -> list[Joined]:
     """Those that others come after: what the transmission passes on beside its spring, limits of the torque."""
     pairs = zip(fitted.chosen, held(fitted), strict=True)
-    return [pair for c, pair in pairs if c.form.effect.equation == "transmission" or _limits(c)]
+    return [
+        Joined(*pair, centred=c.form.signature.centred)
+        for c, pair in pairs
+        if c.form.effect.equation == "transmission" or _limits(c)
+    ]
 
 
 def _limits(chosen: Chosen) -> bool:

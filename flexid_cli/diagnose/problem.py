@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,15 @@ Numbers = TypeVar("Numbers", Array, Complex)
 Part = Callable[["Stretch", Motion], Sequence["Complex | None"]]
 Sharpener = Callable[[Segment, float], Sequence[Array]]
 Effects = Sequence[tuple[Callable[[Motion], Terms], Array]]  # columns of effects and their amplitudes
+
+
+class Joined(NamedTuple):
+    """An effect of the model: its columns, their amplitudes, and whether it has a zero of its own."""
+
+    columns: Callable[[Motion], Terms]
+    amplitudes: Array
+    centred: bool = False
+
 
 HALF_WIDTH = 12  # of the derivatives: exact to 1e-6 up to a third of the sampling rate
 MARGIN = 4 * HALF_WIDTH  # samples at the ends that derivatives of derivatives cannot reach
@@ -223,7 +232,7 @@ class Problem:
         or of the position that the torque shows: the one lacks effects, the other is blurred by noise.
     trust : sequence of ndarray, optional
         Further weight of each row, shape (equations, rows), by stretch.
-    passing : sequence of pairs, optional
+    passing : sequence of Joined, optional
         Effects of the model that others come after: by which the transmission passes on more than its spring does,
         and limits of the torque.
     """
@@ -247,7 +256,7 @@ class Problem:
         rigid: bool = False,
         led: bool = False,
         trust: Sequence[Array] | None = None,
-        passing: Effects = (),
+        passing: Sequence[Joined] = (),
     ) -> None:
         self.stretches, self.noise, self.band_hz = stretches, noise, band_hz
         self.base = replace(base, gear_ratio=gear_ratio)
@@ -278,7 +287,7 @@ class Problem:
         stiffening: float | None = None,
         led: bool | None = None,
         trust: Sequence[Array] | None = None,
-        passing: Effects | None = None,
+        passing: Sequence[Joined] | None = None,
     ) -> Problem:
         """The same record linearised elsewhere, with other errors of positions taken out."""
         recorded = self.recorded if stretches is None else stretches
@@ -404,7 +413,7 @@ class Problem:
     def _with_effects(self, motion: Motion, s: Stretch) -> Motion:
         """The motion as effects see it that come after others of the model: kinematics, then torques."""
         twist = np.zeros(motion.time_s.size)
-        for columns, amplitudes in self.passing:
+        for columns, amplitudes, _ in self.passing:
             more = columns(motion).torsion
             twist = twist if more is None else twist + more @ amplitudes
         if twist.any():
@@ -414,7 +423,7 @@ class Problem:
                 torsion_rate=motion.torsion_rate + s.derivative(twist, 1),
             )
         passed, limited = motion.joint_torque, motion.torque
-        for columns, amplitudes in self.passing:
+        for columns, amplitudes, _ in self.passing:
             terms = columns(motion)
             if terms.transmission is not None:
                 passed = passed + terms.transmission @ amplitudes
@@ -499,13 +508,16 @@ class Problem:
         return self._side_by_side(np.hstack(motor), np.hstack(load))
 
     def _local_stiffness(self, m: Motion) -> Array:
-        """Slope of the torque that the transmission passes on over the torsion: what a step of its zero moves."""
+        """Slope of the torque that the transmission passes on over the torsion: what a step of its zero moves.
+
+        But for effects that have a zero of their own.
+        """
         step = ZERO_STEP * float(np.std(m.deflection))
         aside = [replace(m, torsion=m.torsion + way * step) for way in (0.5, -0.5)]
         slope = np.full(m.deflection.size, self.base.K)
-        for columns, amplitudes in self.passing:
+        for columns, amplitudes, centred in self.passing:
             more, less = (columns(a).transmission for a in aside)
-            if more is not None and less is not None:
+            if more is not None and less is not None and not centred:
                 slope += (more - less) @ amplitudes / step
         return slope
 

@@ -111,6 +111,8 @@ class Signature:
         Whether a linear axis has none.
     curved : bool
         Whether it is a friction whose curve over the velocity the width of the reversal can stand in for.
+    centred : bool
+        Whether one of its shapes is the place of its zero beside the spring's.
     lawless : bool
         Whether the effect's torque law cannot do what this form does, so that no simulation can speak against it.
     """
@@ -130,4 +132,5 @@ class Signature:
     form_doubt: float = 0.0
     rotary: bool = False
     curved: bool = False
+    centred: bool = False
     lawless: bool = False

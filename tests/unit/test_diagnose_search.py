@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flexid_cli.diagnose.basis import Basis, solve
-from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.problem import Joined, Problem, Stretch
 from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
 from flexid_cli.effects.forms import LEAST_PERIODS, lagged
 from flexid_cli.effects.motion import Base, Motion, Terms
@@ -234,7 +234,7 @@ def test_friction_that_grows_with_the_load_sees_all_that_the_transmission_passes
         return Terms(transmission=np.ones((m.time_s.size, 1)))
 
     problem = search.problem
-    more = problem.at(problem.base, passing=[(constant, np.array([5.0]))])
+    more = problem.at(problem.base, passing=[Joined(constant, np.array([5.0]))])
     plain, passed = problem.motions[0], more.motions[0]
     np.testing.assert_allclose(plain.joint_torque, BASE.K * plain.deflection)
     np.testing.assert_allclose(passed.joint_torque - plain.joint_torque, 5.0, rtol=1e-9)
@@ -258,13 +258,15 @@ def test_a_step_of_the_springs_zero_moves_what_effects_add_to_it_too(search, ind
     stiffening = share * p.base.K
 
     def misfit(zero: float) -> np.ndarray:
-        q = p.at(replace(p.base, torsion_zero=zero), stiffening=stiffening, passing=[(columns, amplitude)])
+        q = p.at(
+            replace(p.base, torsion_zero=zero), stiffening=stiffening, passing=[Joined(columns, amplitude)]
+        )
         rows, slopes = q.effect_rows(columns)
         spring = q.base_rows()[:, q.names.index("K")] * (p.base.K + amplitude @ slopes)
         return q.target() - spring - rows @ amplitude
 
     step = 0.005 * size
-    now = p.at(p.base, stiffening=stiffening, passing=[(columns, amplitude)])
+    now = p.at(p.base, stiffening=stiffening, passing=[Joined(columns, amplitude)])
     moved = (misfit(step) - misfit(-step)) / (2.0 * step)
     column = now.base_rows()[:, now.names.index("c")] * now.stiffness
     plain = p.base_rows()[:, p.names.index("c")] * now.stiffness
@@ -284,7 +286,7 @@ def test_a_lag_sees_the_torque_that_a_limit_lets_through_and_the_floor_too(searc
     def columns(m: Motion) -> Terms:
         return limit.signature.columns(m, (height,))
 
-    limited = asked.at(p.base, passing=[(columns, np.ones(1))])
+    limited = asked.at(p.base, passing=[Joined(columns, np.ones(1))])
     (motion,) = limited.motions
     acting = np.clip(motion.torque, -height, height)
     parts = [columns(motion).motor, lag.signature.columns(motion, (0.01,)).motor]
@@ -301,7 +303,7 @@ def test_play_and_damping_see_the_transmissions_error_of_the_model(search):
         return error.signature.columns(m, (cycles,))
 
     (plain,) = p.motions
-    (motion,) = p.at(p.base, passing=[(columns, np.array([0.0, size]))]).motions
+    (motion,) = p.at(p.base, passing=[Joined(columns, np.array([0.0, size]))]).motions
     angle = cycles * motion.motor_position
     np.testing.assert_allclose(motion.torsion, plain.torsion + size * np.sin(angle), atol=1e-12)
     rate = plain.torsion_rate + size * cycles * np.cos(angle) * plain.motor_velocity

@@ -92,5 +92,5 @@ EFFECT = Effect(
     laws=(Law(Stage.CONTACT, _contact),),
     guards=2,
     energy="conserves",
-    signatures=(Signature(_columns, _values, _shapes, sign=1, tied=_tied),),
+    signatures=(Signature(_columns, _values, _shapes, sign=1, tied=_tied, centred=True),),
 )
