@@ -31,6 +31,7 @@ WORTH_A_SIMULATION = 0.3  # loss that an alternative may be behind before it is 
 MOST_LIKELY, FAR_BEHIND, FEW_STEPS = 3, 1.5, 2
 CURVES = (0.1, 0.35, 0.7)  # starts of a curved friction's shape, over its range
 MOST_ROUNDS, STILL = 5, 0.01  # of moving all shapes again, and the change of loss that ends it
+ABOUT_NOISE = 1.15  # RMS of rows in which no other form of an effect is looked for
 LOOKED_AT = 0.6  # gain that a rival may be behind before its own refit
 
 
@@ -89,14 +90,39 @@ def _grown(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
         trials = _added(fitter, fitted, found)
         if not trials or trials[0].gain(fitted) < enough:
             break
-        grown = fitter.reweighted(_needed(fitter, trials[0], enough))
+        needed = _needed(fitter, trials[0], enough)
+        if _names(needed) in seen and _names(trials[0]) not in seen:
+            needed = trials[0]  # what takes the place of a wrong effect may need them both before
+        grown = fitter.reweighted(needed)
         if _names(grown) in seen:  # rows are weighted anew by each set of effects: it could go round for ever
             fitted = _better(fitted, grown)
             break
-        fitted = grown
+        fitted = _reformed(fitter, grown)
         seen.add(_names(fitted))
         found = fitter.candidates(fitted)
     return fitted if fitted is before else _settled(fitter, fitted)
+
+
+def _reformed(fitter: Fitter, fitted: Fitted) -> Fitted:
+    """The same effects, in other forms where that leaves less: the form was chosen before the others were there."""
+    before = fitted
+    for k, c in enumerate(fitted.chosen[:-1]):
+        if fitted.basis.rms < ABOUT_NOISE:
+            break
+        rest = fitter.fit(fitted.problem, without(fitted.chosen, k), fitted.search)
+        forms = [
+            f
+            for f in fitter.forms
+            if f.name == c.name and f != c.form and not (f.signature.extends or f.signature.curved)
+        ]
+        found = [fitted.search.best(f, rest.basis) for f in forms]
+        models = [
+            (*fitted.chosen[:k], Chosen(x.form, x.shape), *fitted.chosen[k + 1 :])
+            for x in found
+            if x is not None and not x.refused
+        ]
+        fitted = min([fitted, *fitter.relaxed(fitted, models)], key=lambda f: f.loss)
+    return fitted if fitted is before else fitter.reweighted(fitted)
 
 
 def _settled(fitter: Fitter, fitted: Fitted) -> Fitted:

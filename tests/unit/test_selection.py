@@ -29,7 +29,7 @@ class Model:
 
     def __init__(self, *names: str, loss: float = 0.0) -> None:
         self.chosen = tuple(SimpleNamespace(name=n) for n in names)
-        self.problem, self.loss = PROBLEM, loss
+        self.problem, self.loss, self.basis = PROBLEM, loss, SimpleNamespace(rms=1.0)
 
     def gain(self, _: Model) -> float:
         return 1.0
@@ -68,6 +68,22 @@ def test_effects_that_displace_each_other_do_not_go_round_for_ever(monkeypatch):
     monkeypatch.setattr(selection, "_added", added)
     monkeypatch.setattr(selection, "_needed", lambda fitter, fitted, enough: fitted)
     assert names(selection._grown(Fitter(), Model(), [])) == ["hysteresis"]
+
+
+def test_a_pair_takes_the_place_of_a_wrong_effect_that_alone_neither_of_them_could(monkeypatch):
+    """Beside the wrong effect the first of them looks needless, and so it goes again until both are there."""
+    offered = {"": "hysteresis", "hysteresis": "error", "error,hysteresis": "damping"}
+    kept = {"error,hysteresis": ["hysteresis"], "damping,error,hysteresis": ["damping", "error"]}
+
+    def added(_, fitted, found):
+        have = names(fitted)
+        return [Model(*have, offered[",".join(have)])] if ",".join(have) in offered else []
+
+    monkeypatch.setattr(selection, "_added", added)
+    monkeypatch.setattr(
+        selection, "_needed", lambda _, f, enough: Model(*kept.get(",".join(names(f)), names(f)))
+    )
+    assert names(selection._grown(Fitter(), Model(), [])) == ["damping", "error"]
 
 
 def test_effects_join_until_nothing_gains(monkeypatch):
@@ -173,3 +189,21 @@ def test_what_a_model_misses_is_no_ground_to_exclude_another(monkeypatch, rms, e
     monkeypatch.setattr(selection, "_simulated", lambda _, f: f)
     _, (alternatives,), _ = selection._alternatives(Fitter(), led("named", 0.0))
     assert (alternatives == ()) == excluded
+
+
+@pytest.mark.parametrize(("rms", "expected"), [(3.0, "cubic"), (1.1, "knee")])
+def test_a_form_chosen_before_the_others_were_there_is_looked_at_again(rms, expected):
+    plain = SimpleNamespace(extends=False, curved=False)
+    knee, cubic = (SimpleNamespace(name="hardening", kind=k, signature=plain) for k in ("knee", "cubic"))
+    search = SimpleNamespace(best=lambda form, _: SimpleNamespace(form=form, shape=(), refused=""))
+
+    def model(form: SimpleNamespace, loss: float) -> Model:
+        made = Model("hardening", "backlash", loss=loss)
+        made.chosen[0].form, made.search, made.basis.rms = form, search, rms
+        return made
+
+    fitter = Fitter()
+    fitter.forms = (knee, cubic)
+    fitter.fit = lambda *_: model(knee, 9.0)
+    fitter.relaxed = lambda _, models: [model(chosen[0].form, 1.0) for chosen in models]
+    assert selection._reformed(fitter, model(knee, 2.0)).chosen[0].form.kind == expected
