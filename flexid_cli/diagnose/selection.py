@@ -15,6 +15,7 @@ from flexid_cli.threads import side_by_side
 
 MOST_EFFECTS = 4
 RIVALS = 3
+WIDE = 8  # rivals where none of the first gains enough, and more than noise stays
 NEAR_RIVAL = 0.5  # of the best candidate's gain
 # Least gain (logarithm of the cost) of an effect, and what an alternative may be worse by. Calibrated, see
 # docs/diagnosis.md.
@@ -88,7 +89,9 @@ def _grown(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
     enough, seen, before = threshold(fitted.problem), {_names(fitted)}, fitted
     while len(fitted.chosen) < MOST_EFFECTS:
         trials = _added(fitter, fitted, found)
-        if not trials or trials[0].gain(fitted) < enough:
+        if not _gains(trials, fitted, enough) and fitted.basis.rms > ABOUT_NOISE:
+            trials = _added(fitter, fitted, found, WIDE)
+        if not _gains(trials, fitted, enough):
             break
         needed = _needed(fitter, trials[0], enough)
         if _names(needed) in seen and _names(trials[0]) not in seen:
@@ -101,6 +104,10 @@ def _grown(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
         seen.add(_names(fitted))
         found = fitter.candidates(fitted)
     return fitted if fitted is before else _settled(fitter, fitted)
+
+
+def _gains(trials: Sequence[Fitted], fitted: Fitted, enough: float) -> bool:
+    return bool(trials) and trials[0].gain(fitted) >= enough
 
 
 def _reformed(fitter: Fitter, fitted: Fitted) -> Fitted:
@@ -274,12 +281,16 @@ def least_gain(fitted: Fitted) -> float:
     return ENOUGH_LED if isinstance(fitted, LedFit) else threshold(fitted.problem)
 
 
-def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> list[Fitted]:
-    """The model with one more effect: those that promise most, after a refit each, the best first."""
+def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate], wide: int = 0) -> list[Fitted]:
+    """The model with one more effect: those that promise most, after a refit each, the best first.
+
+    With ``wide`` so many, however little they promise: one may gain only once the others' shapes make room for it.
+    """
     possible = [c for c in found if not c.refused]
-    if not possible or possible[0].gain < 0.5 * ENOUGH:
+    if not possible or (possible[0].gain < 0.5 * ENOUGH and not wide):
         return []
     rivals = [c for c in possible if c.gain > NEAR_RIVAL * possible[0].gain][:RIVALS]
+    rivals = possible[:wide] if wide else rivals
     starts = [Chosen(c.form, c.shape) for c in rivals]
     if fitted.problem.both:
         starts += [s for c in rivals for s in _curves(fitter, fitted, c.form.name)]
