@@ -207,3 +207,19 @@ def test_a_form_chosen_before_the_others_were_there_is_looked_at_again(rms, expe
     fitter.fit = lambda *_: model(knee, 9.0)
     fitter.relaxed = lambda _, models: [model(chosen[0].form, 1.0) for chosen in models]
     assert selection._reformed(fitter, model(knee, 2.0)).chosen[0].form.kind == expected
+
+
+@pytest.mark.parametrize(("rms", "expected"), [(2.0, ["backlash", "sensor_lag"]), (1.1, ["backlash"])])
+def test_effects_that_promise_little_are_tried_where_more_than_noise_stays(monkeypatch, rms, expected):
+    def added(_, fitted, found, wide=0):
+        more = "sensor_lag" if wide else "hysteresis"
+        model = Model("backlash", more)
+        model.gain = lambda _: 1.0 if wide and len(fitted.chosen) == 1 else 0.0
+        return [model]
+
+    before = Model("backlash")
+    before.basis.rms = rms
+    monkeypatch.setattr(selection, "_added", added)
+    monkeypatch.setattr(selection, "_needed", lambda fitter, fitted, enough: fitted)
+    monkeypatch.setattr(selection, "_settled", lambda fitter, fitted: fitted)
+    assert names(selection._grown(Fitter(), before, [])) == expected
