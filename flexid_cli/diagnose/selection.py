@@ -33,6 +33,7 @@ MOST_LIKELY, FAR_BEHIND, FEW_STEPS = 3, 1.5, 2
 CURVES = (0.1, 0.35, 0.7)  # starts of a curved friction's shape, over its range
 MOST_ROUNDS, STILL = 5, 0.01  # of moving all shapes again, and the change of loss that ends it
 ABOUT_NOISE = 1.15  # RMS of rows in which no other form of an effect is looked for
+NEEDLESS = 0.5  # of the least gain: what an effect explains that goes again in the end
 LOOKED_AT = 0.6  # gain that a rival may be behind before its own refit
 
 
@@ -103,7 +104,16 @@ def _grown(fitter: Fitter, fitted: Fitted, found: list[Candidate]) -> Fitted:
         fitted = _reformed(fitter, grown)
         seen.add(_names(fitted))
         found = fitter.candidates(fitted)
-    return fitted if fitted is before else _settled(fitter, fitted)
+    return fitted if fitted is before else _pruned(fitter, _settled(fitter, fitted))
+
+
+def _pruned(fitter: Fitter, fitted: Fitted) -> Fitted:
+    """Without effects that explain nothing any more once the others have settled: they stood in for their shapes."""
+    for k in reversed(range(len(fitted.chosen))):
+        rest = fitter.fit(fitted.problem, without(fitted.chosen, k), fitted.search)
+        if len(fitted.chosen) > 1 and fitted.gain(rest) < NEEDLESS * ENOUGH:
+            fitted = _settled(fitter, rest)
+    return fitted
 
 
 def _gains(trials: Sequence[Fitted], fitted: Fitted, enough: float) -> bool:

@@ -29,7 +29,7 @@ class Model:
 
     def __init__(self, *names: str, loss: float = 0.0) -> None:
         self.chosen = tuple(SimpleNamespace(name=n) for n in names)
-        self.problem, self.loss, self.basis = PROBLEM, loss, SimpleNamespace(rms=1.0)
+        self.problem, self.loss, self.basis, self.search = PROBLEM, loss, SimpleNamespace(rms=1.0), None
 
     def gain(self, _: Model) -> float:
         return 1.0
@@ -53,6 +53,9 @@ class Fitter:
 
     def candidates(self, _: Model) -> list:
         return []
+
+    def fit(self, _: object, chosen: tuple, __: object) -> Model:
+        return Model(*(c.name for c in chosen))
 
     def reweighted(self, model: Model) -> Model:
         return model
@@ -223,3 +226,10 @@ def test_effects_that_promise_little_are_tried_where_more_than_noise_stays(monke
     monkeypatch.setattr(selection, "_needed", lambda fitter, fitted, enough: fitted)
     monkeypatch.setattr(selection, "_settled", lambda fitter, fitted: fitted)
     assert names(selection._grown(Fitter(), before, [])) == expected
+
+
+def test_what_explains_nothing_in_the_end_goes_again(monkeypatch):
+    model = Model("hysteresis", "ripple", "payload")
+    model.gain = lambda rest: 1.0 if "ripple" in names(rest) else 0.01
+    monkeypatch.setattr(selection, "_settled", lambda _, fitted: fitted)
+    assert names(selection._pruned(Fitter(), model)) == ["hysteresis", "payload"]
