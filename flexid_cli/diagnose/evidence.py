@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import solve
-from flexid_cli.diagnose.fitter import Fitted, Fitter, informed, without
+from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter, informed, without
 from flexid_cli.diagnose.led import LedFit
 from flexid_cli.diagnose.led import predicted as led_rows
 from flexid_cli.diagnose.problem import Problem
-from flexid_cli.diagnose.search import Search
+from flexid_cli.diagnose.search import Search, minimum
 
 Array = NDArray[np.float64]
 
@@ -22,6 +22,7 @@ BLOCKS = 24  # of the score test: long against the residual's correlation, many 
 # block its neighbours pass too, or the prediction would be one of frequencies that were never seen.
 FOLDS, FOLD_BLOCKS = 5, 20
 STABILITY_BLOCKS = 6
+INSTANTS, MOST_STEPS = 60, 20  # of an event in another record: of the first look, and of closing in
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def cross_validated(fitted: Fitted) -> Array:
 
 
 def predicted(problem: Problem, fitter: Fitter, fitted: Fitted) -> Array:
-    """Residual rows of another record with all parameters of ``fitted``."""
+    """Residual rows of another record with all parameters of ``fitted``; events have their own instants there."""
     if isinstance(fitted, LedFit) and (led := led_rows(problem, fitted)) is not None:
         return led
     here = fitted.problem
@@ -87,10 +88,41 @@ def predicted(problem: Problem, fitter: Fitter, fitted: Fitted) -> Array:
         here.base, shift=here.shift, applied=here.applied, stiffening=here.stiffening, led=here.led
     )
     if fitted.chosen and other.both:
+        fitted = _with_own_instants(other, fitter, fitted)
         other = informed(other, fitted)
+    return _left(other, fitter, fitted)
+
+
+def _left(other: Problem, fitter: Fitter, fitted: Fitted) -> Array:
+    """What the parameters of a fit leave of another record, linearised as that is."""
     held = {c.form: fitted.slopes(k) for k, c in enumerate(fitted.chosen)}
     there = fitter.fit(other, fitted.chosen, Search(other, fitter.forms, held))
     return np.asarray(there.y - there.basis.columns @ fitted.basis.coefficients)
+
+
+def _with_own_instants(other: Problem, fitter: Fitter, fitted: Fitted) -> Fitted:
+    """The fit with the events where they happened in another record, if they did."""
+    for k, c in enumerate(fitted.chosen):
+        if not c.form.signature.event:
+            continue
+        amplitudes = fitted.amplitudes(k)
+        left = _left(other, fitter, fitted) + other.effect_rows(c.terms)[0] @ amplitudes
+
+        def cost(instant: float, c: Chosen = c, left: Array = left, amplitudes: Array = amplitudes) -> float:
+            e = left - other.effect_rows(Chosen(c.form, (instant,)).terms)[0] @ amplitudes
+            return float(e @ e)
+
+        points = np.linspace(0.0, other.duration_s, INSTANTS)
+        costs = [cost(float(t)) for t in points]
+        at = int(np.argmin(costs))
+        first = points[max(at - 1, 0) : at + 2]
+        period = other.stretches[0].period_s
+        best, least = minimum(cost, 0.0, other.duration_s, tuple(first), 0.5 * period, MOST_STEPS)
+        instant = best if least < min(costs) else float(points[at])
+        fitted = replace(
+            fitted, chosen=(*fitted.chosen[:k], Chosen(c.form, (instant,)), *fitted.chosen[k + 1 :])
+        )
+    return fitted
 
 
 def held_out_gain(before: Array, after: Array) -> float:

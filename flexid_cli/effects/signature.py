@@ -111,6 +111,8 @@ class Signature:
         Whether a linear axis has none.
     curved : bool
         Whether it is a friction whose curve over the velocity the width of the reversal can stand in for.
+    event : bool
+        Whether its shape is an instant of the record: another record of the axis has its own.
     centred : bool
         Whether one of its shapes is the place of its zero beside the spring's.
     lawless : bool
@@ -132,5 +134,6 @@ class Signature:
     form_doubt: float = 0.0
     rotary: bool = False
     curved: bool = False
+    event: bool = False
     centred: bool = False
     lawless: bool = False

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+from flexid_cli.diagnose import evidence
 from flexid_cli.diagnose.basis import Basis, solve
+from flexid_cli.diagnose.fitter import Chosen
 from flexid_cli.diagnose.problem import Joined, Problem, Stretch
 from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
 from flexid_cli.effects.forms import LEAST_PERIODS, lagged
@@ -21,6 +23,19 @@ RATE, BAND, SAMPLES = 500.0, 50.0, 10_000
 BASE = Base(
     Jm=2.0, K=3000.0, JL=1.5, FVm=1.0, FSm=0.5, FV=0.4, FS=0.2, motor_reversal=0.01, load_reversal=0.01
 )
+
+
+@dataclass(frozen=True)
+class SimpleFit:
+    """A fit of one effect."""
+
+    chosen: tuple[Chosen, ...]
+    size: np.ndarray
+
+    def amplitudes(self, _: int) -> np.ndarray:
+        return self.size
+
+
 FORMS = [Form(e, k) for e in effects() for k in range(len(e.signatures))]
 
 
@@ -311,3 +326,16 @@ def test_play_and_damping_see_the_transmissions_error_of_the_model(search):
     np.testing.assert_allclose(motion.torsion_rate[inner], rate[inner], atol=1e-3 * np.abs(rate).max())
     np.testing.assert_allclose(motion.joint_torque, p.base.K * motion.torsion, rtol=1e-9, atol=1e-6)
     np.testing.assert_array_equal(motion.deflection, plain.deflection)
+
+
+@pytest.mark.parametrize("instant", [4.321, 13.77, 17.0])
+def test_an_event_has_its_own_instant_in_another_record(search, monkeypatch, instant):
+    payload, other, size = form("payload_change"), search.problem, np.array([0.3])
+
+    def rows(when: float) -> np.ndarray:
+        return other.effect_rows(Chosen(payload, (when,)).terms)[0] @ size
+
+    fitted = SimpleFit(chosen=(Chosen(payload, (9.0,)),), size=size)
+    monkeypatch.setattr(evidence, "_left", lambda _, __, f: rows(instant) - rows(*f.chosen[0].shape))
+    found = evidence._with_own_instants(other, None, fitted)
+    assert found.chosen[0].shape[0] == pytest.approx(instant, abs=3.0 / RATE)

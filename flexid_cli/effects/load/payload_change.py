@@ -71,5 +71,5 @@ EFFECT = Effect(
     laws=(Law(Stage.LOAD, _torque),),
     guards=1,
     energy="exchanges",
-    signatures=(Signature(_columns, _values, _shapes),),
+    signatures=(Signature(_columns, _values, _shapes, event=True),),
 )
