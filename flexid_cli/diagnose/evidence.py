@@ -101,7 +101,10 @@ def _left(other: Problem, fitter: Fitter, fitted: Fitted) -> Array:
 
 
 def _with_own_instants(other: Problem, fitter: Fitter, fitted: Fitted) -> Fitted:
-    """The fit with the events where they happened in another record, if they did."""
+    """The fit with the events where they happened in another record.
+
+    At its start or its end where they did not: it speaks for or against their size, not against their having been.
+    """
     for k, c in enumerate(fitted.chosen):
         if not c.form.signature.event:
             continue
@@ -113,12 +116,10 @@ def _with_own_instants(other: Problem, fitter: Fitter, fitted: Fitted) -> Fitted
             return float(e @ e)
 
         points = np.linspace(0.0, other.duration_s, INSTANTS)
-        costs = [cost(float(t)) for t in points]
-        at = int(np.argmin(costs))
+        at = int(np.argmin([cost(float(t)) for t in points]))
         first = points[max(at - 1, 0) : at + 2]
         period = other.stretches[0].period_s
-        best, least = minimum(cost, 0.0, other.duration_s, tuple(first), 0.5 * period, MOST_STEPS)
-        instant = best if least < min(costs) else float(points[at])
+        instant, _ = minimum(cost, 0.0, other.duration_s, tuple(first), 0.5 * period, MOST_STEPS)
         fitted = replace(
             fitted, chosen=(*fitted.chosen[:k], Chosen(c.form, (instant,)), *fitted.chosen[k + 1 :])
         )

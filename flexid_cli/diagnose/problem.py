@@ -397,7 +397,6 @@ class Problem:
             motor_sign=motor_sign,
             joint_sign=joint_sign,
             deflection=deflection,
-            deflection_rate=s.motor_velocity - velocity,
             torsion=deflection,
             torsion_rate=s.motor_velocity - velocity,
             joint_torque=base.K * deflection,
@@ -412,23 +411,26 @@ class Problem:
 
     def _with_effects(self, motion: Motion, s: Stretch) -> Motion:
         """The motion as effects see it that come after others of the model: kinematics, then torques."""
-        twist = np.zeros(motion.time_s.size)
-        for columns, amplitudes, _ in self.passing:
-            more = columns(motion).torsion
-            twist = twist if more is None else twist + more @ amplitudes
-        if twist.any():
+        seen = [one.columns(motion) for one in self.passing]
+        errors = [
+            t.torsion @ one.amplitudes
+            for t, one in zip(seen, self.passing, strict=True)
+            if t.torsion is not None
+        ]
+        if errors:
+            twist = np.sum(errors, axis=0)
             motion = replace(
                 motion,
                 torsion=motion.torsion + twist,
                 torsion_rate=motion.torsion_rate + s.derivative(twist, 1),
             )
+            seen = [one.columns(motion) for one in self.passing]
         passed, limited = motion.joint_torque, motion.torque
-        for columns, amplitudes, _ in self.passing:
-            terms = columns(motion)
+        for terms, one in zip(seen, self.passing, strict=True):
             if terms.transmission is not None:
-                passed = passed + terms.transmission @ amplitudes
+                passed = passed + terms.transmission @ one.amplitudes
             if terms.motor is not None:
-                limited = limited - terms.motor @ amplitudes
+                limited = limited - terms.motor @ one.amplitudes
         return replace(motion, joint_torque=passed, limited_torque=limited)
 
     def led_position(self, s: Stretch) -> Array:
@@ -515,10 +517,12 @@ class Problem:
         step = ZERO_STEP * float(np.std(m.deflection))
         aside = [replace(m, torsion=m.torsion + way * step) for way in (0.5, -0.5)]
         slope = np.full(m.deflection.size, self.base.K)
-        for columns, amplitudes, centred in self.passing:
-            more, less = (columns(a).transmission for a in aside)
-            if more is not None and less is not None and not centred:
-                slope += (more - less) @ amplitudes / step
+        for one in self.passing:
+            if one.centred:
+                continue
+            more, less = (one.columns(a).transmission for a in aside)
+            if more is not None and less is not None:
+                slope += (more - less) @ one.amplitudes / step
         return slope
 
     @staticmethod

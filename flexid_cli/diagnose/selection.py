@@ -20,9 +20,7 @@ NEAR_RIVAL = 0.5  # of the best candidate's gain
 # Least gain (logarithm of the cost) of an effect, and what an alternative may be worse by. Calibrated, see
 # docs/diagnosis.md.
 ENOUGH = 0.12
-ENOUGH_ALONE = (
-    0.15  # flexible, without a joint encoder: of the linear fit, which a simulation confirms where it can
-)
+ENOUGH_ALONE = 0.15  # without a joint encoder: of the linear fit, which a simulation confirms where it can
 ENOUGH_LED = 0.12  # of fits by simulation
 AS_GOOD = 0.05
 # Gain that the linear fit may have over its simulation, for noise in its columns makes it look better than it is.
@@ -215,7 +213,7 @@ def _reshaped(fitter: Fitter, fitted: Fitted) -> Fitted:
     """
     best = fitted
     for k, c in enumerate(fitted.chosen):
-        starts = [s for s in _curves(fitter, fitted, c.form.name) if c.form.signature.curved]
+        starts = _curves(fitter, fitted, c.form.name) if c.form.signature.curved else []
         models = [(*fitted.chosen[:k], s, *fitted.chosen[k + 1 :]) for s in starts]
         simulated = [s for f in fitter.relaxed(fitted, models) if (s := _simulated(fitter, f))]
         best = min([best, *simulated], key=lambda f: f.loss)
@@ -299,8 +297,8 @@ def _added(fitter: Fitter, fitted: Fitted, found: list[Candidate], wide: int = 0
     possible = [c for c in found if not c.refused]
     if not possible or (possible[0].gain < 0.5 * ENOUGH and not wide):
         return []
-    rivals = [c for c in possible if c.gain > NEAR_RIVAL * possible[0].gain][:RIVALS]
-    rivals = possible[:wide] if wide else rivals
+    near = [c for c in possible if c.gain > NEAR_RIVAL * possible[0].gain][:RIVALS]
+    rivals = possible[:wide] if wide else near
     starts = [Chosen(c.form, c.shape) for c in rivals]
     if fitted.problem.both:
         starts += [s for c in rivals for s in _curves(fitter, fitted, c.form.name)]
@@ -337,15 +335,14 @@ def _alternatives(
     alone = not (fitted.problem.both or fitted.problem.rigid)
     alternatives, rivals = [], []
     for k in range(len(fitted.chosen)):
-        refits, worse = _others(
-            fitter, fitted, k, max(WORTH_A_SIMULATION, _missing(fitted)) if alone else AS_GOOD
-        )
+        far = max(WORTH_A_SIMULATION, _missing(fitted)) if alone else AS_GOOD
+        refits, worse = _others(fitter, fitted, k, far)
         if alone:
             refits = [s for f in refits if (s := _simulated(fitter, f))]
         if alone and len(fitted.chosen) == 1 and refits:
             own = [] if _denied(fitted) else [fitted]
             fitted, *refits = sorted([*own, *refits], key=lambda f: f.loss)
-        near = max(AS_GOOD, _missing(fitted)) if alone else AS_GOOD
+        near = max(AS_GOOD, _missing(fitted))
         alternatives.append(tuple(f for f in refits if f.loss - fitted.loss < near))
         rivals.append(tuple(sorted(worse, key=lambda w: w[1])))
     return fitted, tuple(alternatives), tuple(rivals)

@@ -37,15 +37,8 @@ MOST_STARTS = 6
 RIGID = 100.0  # times the band: a resonance that is nowhere in it
 SCANNED_WITH = ("torque_offset", "gravity", "joint_damping", "load_dependent_friction", "viscous_nonlinear")
 LEAST_LINES = 8  # of a spectrum, to read the torque's noise from
-LAGS = (
-    0.5,
-    1.0,
-    2.0,
-    4.0,
-    8.0,
-    16.0,
-    32.0,
-)  # of the torque, sampling periods, where plain least squares fail
+# Lags of the torque, sampling periods, that are tried where plain least squares find no axis.
+LAGS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 SCAN_LOW = 8.0  # lowest locked-motor frequency looked at, cycles in the record
 
 

@@ -55,10 +55,11 @@ class Motion:
         Low-passed; without a joint encoder the joint's are rebuilt from eq. (14).
     motor_sign, joint_sign : ndarray
         sgn of the velocities with the baseline's reversal width.
-    deflection, deflection_rate : ndarray
-        Difference of the positions, without the spring's zero, and its rate.
+    deflection : ndarray
+        Difference of the positions, without the spring's zero.
     torsion, torsion_rate : ndarray
-        The same with what the transmission's kinematics add, by the effects that the model has: what the spring sees.
+        The same with what the transmission's kinematics add, by the effects that the model has: what the spring sees;
+        and its rate.
     joint_torque : ndarray
         Torque that the transmission passes on: its spring's, and that of the effects that the model has there.
     period_s : float
@@ -86,7 +87,6 @@ class Motion:
     motor_sign: Array
     joint_sign: Array
     deflection: Array
-    deflection_rate: Array
     torsion: Array
     torsion_rate: Array
     joint_torque: Array

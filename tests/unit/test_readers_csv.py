@@ -23,6 +23,7 @@ from flexid_cli.readers.dialect import (
     Detect,
     Dialect,
     Field,
+    detect,
     detect_encoding,
     is_number,
     is_whole,
@@ -583,3 +584,24 @@ def test_blocks_and_single_lines_are_read_alike(lines: list[str], wanted: tuple[
             one, two = (each.columns[place].astype(float) for each in (rows, slow))
             assert np.array_equal(one, two, equal_nan=True)
             assert np.array_equal(np.signbit(one), np.signbit(two)) or np.isnan(one).any()
+
+
+@pytest.mark.parametrize(
+    ("lines", "fields", "decimal"),
+    [
+        (
+            ["x", "1,5", "2", "3,25", "4"],
+            1,
+            ",",
+        ),  # one column: no semicolon, tab or space tells it from the comma
+        (["x", "1.5", "2", "3.25", "4"], 1, "."),
+        (["x y", "1,5 2", "2 3", "3,25 4"], 2, ","),
+        (["x\ty", "1,5\t2,0", "2,5\t3,0"], 2, ","),
+        (["x|y", "1.5|2", "2.5|3"], 2, "."),
+    ],
+)
+def test_delimiters_that_stand_nowhere_are_looked_at_but_once(
+    lines: list[str], fields: int, decimal: str
+) -> None:
+    found = detect(lines, Detect())
+    assert (len(found.fields), found.decimal) == (fields, decimal)
