@@ -56,8 +56,8 @@ def _shapes(scale: Scale) -> Sequence[Shape]:
     high = min(1.3 * scale.band_hz, 0.45 / scale.period_s)
     return (
         # A lightly damped mode between two frequencies is met by none of them unless the damping's points overlap.
-        Shape("frequency", 0.3 * scale.resonance_hz, high, 22),
-        Shape("damping_ratio", 0.01, 0.3, 3),
+        Shape("frequency", 0.2 * scale.resonance_hz, high, 25),
+        Shape("damping_ratio", 0.01, 0.7, 4),
     )
 
 
