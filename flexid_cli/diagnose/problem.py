@@ -504,26 +504,31 @@ class Problem:
     def _base_both(self, s: Stretch, m: Motion) -> list[Complex]:
         known = s.both_spectra
         gravity = self.gravity * known["gravity"]
-        one = s.spectrum(self._local_stiffness(m) / self.stiffness) if self.passing else known["one"]
+        one = s.spectrum(self._zero_moved(s, m)) if self.passing else known["one"]
         motor = [known["motor"], s.spectrum(m.motor_sign), self._twist(s), one]
         load = [-one, known["joint"], s.spectrum(m.joint_sign), gravity]
         return self._side_by_side(np.hstack(motor), np.hstack(load))
 
-    def _local_stiffness(self, m: Motion) -> Array:
-        """Slope of the torque that the transmission passes on over the torsion: what a step of its zero moves.
+    def _zero_moved(self, s: Stretch, m: Motion) -> Array:
+        """What a step of the spring's zero changes, but for effects that have a zero of their own; one in the mean."""
+        moved = [one for one in self.passing if not one.centred]
+        return self._passed_on(s, m, np.ones((m.torsion.size, 1)), moved)[:, 0] / self.stiffness
 
-        But for effects that have a zero of their own.
-        """
-        step = ZERO_STEP * float(np.std(m.deflection))
-        aside = [replace(m, torsion=m.torsion + way * step) for way in (0.5, -0.5)]
-        slope = np.full(m.deflection.size, self.base.K)
-        for one in self.passing:
-            if one.centred:
-                continue
-            more, less = (one.columns(a).transmission for a in aside)
-            if more is not None and less is not None:
-                slope += (more - less) @ one.amplitudes / step
-        return slope
+    def _passed_on(self, s: Stretch, m: Motion, twist: Array, joined: Sequence[Joined]) -> Array:
+        """Torque that spring and effects pass on for a torsion that is larger by each column, to first order."""
+        passed = self.base.K * twist
+        for k, column in enumerate(twist.T if joined else ()):
+            step = ZERO_STEP * float(np.std(m.deflection)) / max(float(np.abs(column).max()), 1e-300)
+            rate = s.derivative(column, 1)
+            more, less = (
+                replace(m, torsion=m.torsion + h * column, torsion_rate=m.torsion_rate + h * rate)
+                for h in (0.5 * step, -0.5 * step)
+            )
+            for one in joined:
+                change = one.columns(more).since(one.columns(less)).transmission
+                if change is not None:
+                    passed[:, k] += change @ one.amplitudes / step
+        return passed
 
     @staticmethod
     def _side_by_side(M: Complex, L: Complex) -> list[Complex]:
@@ -596,7 +601,7 @@ class Problem:
 
         def part(s: Stretch, m: Motion) -> list[Complex | None]:
             seen.append(terms_of(m))
-            return self.place(s, seen[-1])
+            return self.place(s, m, seen[-1])
 
         rows = self._rows(part)
         if not self.both or seen[0].transmission is None:
@@ -649,28 +654,28 @@ class Problem:
     @cached_property
     def _torsion(self) -> Array:
         """Rows of a spring of unit stiffness, shape (r,)."""
-        return self._rows(lambda s, m: self._place_both(s, Terms(transmission=m.deflection[:, None])))[:, 0]
+        return self._rows(lambda s, m: self._place_both(s, m, Terms(transmission=m.deflection[:, None])))[
+            :, 0
+        ]
 
-    def place(self, s: Stretch, t: Terms) -> list[Complex | None]:
+    def place(self, s: Stretch, m: Motion, t: Terms) -> list[Complex | None]:
         """Spectra of what an effect adds to each equation."""
-        return (self._place_both if self.both else self._place_alone)(s, t)
+        return self._place_both(s, m, t) if self.both else self._place_alone(s, t)
 
-    def _place_both(self, s: Stretch, t: Terms) -> list[Complex | None]:
+    def _place_both(self, s: Stretch, m: Motion, t: Terms) -> list[Complex | None]:
         b = self.base
         motor, load = (None if x is None else s.spectrum(x) for x in (t.motor, t.load))
         if t.transmission is not None:
             passed_on = s.spectrum(t.transmission)
             motor, load = _plus(motor, passed_on), _plus(load, -passed_on)
         if t.joint_error is not None:
-            e = t.joint_error
-            motor = _plus(motor, b.K * s.spectrum(e))
-            load = _plus(load, -s.spectrum(b.JL * s.derivative(e, 2) + b.FV * s.derivative(e, 1) + b.K * e))
+            e, passed = t.joint_error, self._passed_on(s, m, t.joint_error, self.passing)
+            motor = _plus(motor, s.spectrum(passed))
+            load = _plus(load, -s.spectrum(b.JL * s.derivative(e, 2) + b.FV * s.derivative(e, 1) + passed))
         if t.motor_error is not None:
-            e = t.motor_error
-            motor = _plus(
-                motor, -s.spectrum(b.Jm * s.derivative(e, 2) + b.FVm * s.derivative(e, 1) + b.K * e)
-            )
-            load = _plus(load, b.K * s.spectrum(e))
+            e, passed = t.motor_error, self._passed_on(s, m, t.motor_error, self.passing)
+            motor = _plus(motor, -s.spectrum(b.Jm * s.derivative(e, 2) + b.FVm * s.derivative(e, 1) + passed))
+            load = _plus(load, s.spectrum(passed))
         return [motor, load]
 
     def _place_alone(self, s: Stretch, t: Terms) -> list[Complex | None]:

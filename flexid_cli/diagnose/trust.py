@@ -53,7 +53,7 @@ def _added_noise(problem: Problem, effects: Effects, rng: np.random.Generator) -
             errors = noisy.torque - s.torque, noisy.motor - s.motor, joint
             known = w.plain(_known_noise(problem, s, *errors))[:, :, 0]
             through = [(columns(moved).since(columns(m)), amplitudes) for columns, amplitudes in effects]
-            changed = sum((w.plain(problem.place(s, t)) @ amplitudes for t, amplitudes in through), known)
+            changed = sum((w.plain(problem.place(s, m, t)) @ amplitudes for t, amplitudes in through), known)
             power += changed**2 - known**2
         out.append(power)
     return out

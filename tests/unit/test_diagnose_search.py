@@ -289,6 +289,56 @@ def test_a_step_of_the_springs_zero_moves_what_effects_add_to_it_too(search, ind
     assert near < 0.15 * far, (near, far)
 
 
+@pytest.mark.parametrize("side", [0, 1], ids=["joint", "motor"])
+@pytest.mark.parametrize(
+    ("name", "index", "shape", "share"),
+    [
+        ("hardening_stiffness", 1, (0.5,), 0.7),
+        ("backlash", 0, (0.4, 0.05), 0.9),
+        ("joint_damping", 0, (), 0.01),
+    ],
+)
+def test_an_encoders_error_passes_what_effects_add_to_the_spring_too(search, name, index, shape, share, side):
+    # Without that, wave and zero trade places until both are wrong, and a knee of the stiffness with them.
+    passing, error, p = form(name, index), form("encoder_eccentricity", side), search.problem
+    size = p.scale().deflection
+    shape = tuple(x * size for x in shape)
+
+    def columns(m: Motion) -> Terms:
+        return passing.signature.columns(m, shape)
+
+    def errors(m: Motion) -> Terms:
+        return error.signature.columns(m, ())
+
+    amplitude = np.array([share * p.base.K])
+    stiffening = float(amplitude @ p.slopes(columns))
+    joined = [Joined(columns, amplitude, centred=passing.signature.centred)]
+    s = p.stretches[0]
+    terms = errors(p.motions[0])
+    wave = terms.joint_error if side == 0 else terms.motor_error
+    assert wave is not None
+    own = {n: getattr(p.base, n, 0.0) for n in p.names} | {"FSm": 0.0, "FS": 0.0}
+
+    def misfit(a: float) -> np.ndarray:
+        joint, motor = (
+            (s.joint + a * wave[:, 0], s.motor) if side == 0 else (s.joint, s.motor + a * wave[:, 0])
+        )
+        moved = s.like(replace(s.segment, joint_position=joint, motor_position=motor))
+        q = p.at(p.base, stretches=[moved], stiffening=stiffening, passing=joined)
+        rows, slopes = q.effect_rows(columns, p.slopes(columns))
+        theta = np.array([own[n] for n in q.names])
+        theta[q.names.index("K")] += amplitude @ slopes
+        return q.target() - q.base_rows() @ theta - rows @ amplitude
+
+    step = 0.005 * size
+    now = p.at(p.base, stiffening=stiffening, passing=joined)
+    moved = (misfit(step) - misfit(-step)) / (2.0 * step)
+    near, far = (
+        np.linalg.norm(moved - q.effect_rows(errors)[0][:, 0]) / np.linalg.norm(moved) for q in (now, p)
+    )
+    assert near < 0.15 * far, (near, far)
+
+
 def test_a_lag_sees_the_torque_that_a_limit_lets_through_and_the_floor_too(search):
     limit, lag, p = form("torque_saturation"), form("actuator_lag"), search.problem
     windup = np.where(
