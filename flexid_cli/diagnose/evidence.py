@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import solve
-from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter, informed, without
+from flexid_cli.diagnose.fitter import Fitted, Fitter, informed, without
+from flexid_cli.diagnose.instants import own_instant
 from flexid_cli.diagnose.led import LedFit
 from flexid_cli.diagnose.led import predicted as led_rows
 from flexid_cli.diagnose.problem import Problem
-from flexid_cli.diagnose.search import Search, minimum
+from flexid_cli.diagnose.search import Search
 
 Array = NDArray[np.float64]
 
@@ -22,7 +23,6 @@ BLOCKS = 24  # of the score test: long against the residual's correlation, many 
 # block its neighbours pass too, or the prediction would be one of frequencies that were never seen.
 FOLDS, FOLD_BLOCKS = 5, 20
 STABILITY_BLOCKS = 6
-INSTANTS, MOST_STEPS = 60, 20  # of an event in another record: of the first look, and of closing in
 
 
 @dataclass(frozen=True)
@@ -101,28 +101,13 @@ def _left(other: Problem, fitter: Fitter, fitted: Fitted) -> Array:
 
 
 def _with_own_instants(other: Problem, fitter: Fitter, fitted: Fitted) -> Fitted:
-    """The fit with the events where they happened in another record.
-
-    At its start or its end where they did not: it speaks for or against their size, not against their having been.
-    """
+    """The fit with the events where they happened in another record."""
     for k, c in enumerate(fitted.chosen):
-        if not c.form.signature.event:
-            continue
-        amplitudes = fitted.amplitudes(k)
-        left = _left(other, fitter, fitted) + other.effect_rows(c.terms)[0] @ amplitudes
-
-        def cost(instant: float, c: Chosen = c, left: Array = left, amplitudes: Array = amplitudes) -> float:
-            e = left - other.effect_rows(Chosen(c.form, (instant,)).terms)[0] @ amplitudes
-            return float(e @ e)
-
-        points = np.linspace(0.0, other.duration_s, INSTANTS)
-        at = int(np.argmin([cost(float(t)) for t in points]))
-        first = points[max(at - 1, 0) : at + 2]
-        period = other.stretches[0].period_s
-        instant, _ = minimum(cost, 0.0, other.duration_s, tuple(first), 0.5 * period, MOST_STEPS)
-        fitted = replace(
-            fitted, chosen=(*fitted.chosen[:k], Chosen(c.form, (instant,)), *fitted.chosen[k + 1 :])
-        )
+        if c.form.signature.event:
+            amplitudes = fitted.amplitudes(k)
+            left = _left(other, fitter, fitted) + other.effect_rows(c.terms)[0] @ amplitudes
+            there = own_instant(other, c, amplitudes, left)
+            fitted = replace(fitted, chosen=(*fitted.chosen[:k], there, *fitted.chosen[k + 1 :]))
     return fitted
 
 

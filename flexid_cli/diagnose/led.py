@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import Basis
 from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter
+from flexid_cli.diagnose.instants import own_instant
 from flexid_cli.diagnose.problem import ALONE_NAMES, MOTOR_SIGN_BAND, Problem, Stretch, later
 from flexid_cli.diagnose.reversals import motor_sharpened
 from flexid_cli.diagnose.rows import Complex
@@ -91,6 +92,10 @@ class Point:
             chosen.append(Chosen(c.form, tuple(float(v) for v in x[i : i + len(c.shape)])))
             i += len(c.shape)
         return Point(base, tuple(amplitudes), tuple(chosen), x[i:-2])
+
+    def with_chosen(self, k: int, other: Chosen) -> Point:
+        """The same model with another shape of the k-th effect."""
+        return replace(self, chosen=(*self.chosen[:k], other, *self.chosen[k + 1 :]))
 
     def shapes(self) -> list[int]:
         """Places of the effects' shapes in the vector."""
@@ -313,12 +318,27 @@ def predicted(problem: Problem, fitted: LedFit) -> Array | None:
     """
     here = problem.at(fitted.problem.base, shift=fitted.problem.shift)
     point = replace(fitted.point, starts=starts(here))
+    if any(c.form.signature.event for c in point.chosen):
+        point, _ = _shown(here, point)
     here = _informed(here, fitted, point)
     simulated = _started(here, point)
     if simulated is None:
         return None
-    shown = (_unexplained(here.at(point.base, led=led), point) for led in (False, True))
-    return min((simulated, *shown), key=lambda e: float(e @ e))
+    return min(simulated, _shown(here, point)[1], key=lambda e: float(e @ e))
+
+
+def _shown(problem: Problem, point: Point) -> tuple[Point, Array]:
+    """What a point leaves of eq. (18) with the joint's motion that the record shows, and its events there."""
+    found = []
+    for led in (False, True):
+        here, own = problem.at(point.base, led=led), point
+        for k, c in enumerate(point.chosen):
+            if c.form.signature.event:
+                a = own.amplitudes[k]
+                left = _unexplained(here, own) + here.effect_rows(own.chosen[k].terms)[0] @ a
+                own = own.with_chosen(k, own_instant(here, c, a, left))
+        found.append((own, _unexplained(here, own)))
+    return min(found, key=lambda f: float(f[1] @ f[1]))
 
 
 def _started(problem: Problem, point: Point) -> Array | None:

@@ -510,7 +510,7 @@ class Problem:
         return self._side_by_side(np.hstack(motor), np.hstack(load))
 
     def _zero_moved(self, s: Stretch, m: Motion) -> Array:
-        """What a step of the spring's zero changes, but for effects that have a zero of their own; one in the mean."""
+        """What a step of the spring's zero changes, but for effects with a zero of their own; one in the mean."""
         moved = [one for one in self.passing if not one.centred]
         return self._passed_on(s, m, np.ones((m.torsion.size, 1)), moved)[:, 0] / self.stiffness
 

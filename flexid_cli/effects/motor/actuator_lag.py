@@ -52,7 +52,7 @@ def _columns(m: Motion, shape: Sequence[float]) -> Terms:
 
 
 def _shapes(scale: Scale) -> Sequence[Shape]:
-    return (Shape("lag", 0.15 * scale.period_s, 0.25 / scale.resonance_hz, 12),)
+    return (Shape("lag", 0.15 * scale.period_s, 1.0 / scale.resonance_hz, 15),)
 
 
 def _values(_: Array, shape: Sequence[float], __: Base) -> dict[str, float]:
