@@ -29,9 +29,10 @@ BASE = Base(
 )
 CUBIC = 3e5
 HARDENING = Form(effect("hardening_stiffness"), 0)
+HARDENS = EffectValues("hardening_stiffness", {"cubic_stiffness": CUBIC})
 
 
-def problem(seed: int, base: Base = BASE) -> Problem:
+def problem(seed: int, base: Base = BASE, hidden: EffectValues = HARDENS) -> Problem:
     """A record of an axis whose spring hardens, as the motor's encoder and the current sensor show it."""
     rng, t = np.random.default_rng(seed), np.arange(SAMPLES) / RATE
     frequency = np.geomspace(0.2, 14.0, 24)
@@ -42,8 +43,7 @@ def problem(seed: int, base: Base = BASE) -> Problem:
         Jm=BASE.Jm, K=BASE.K, JL=BASE.JL, FVm=BASE.FVm, FSm=BASE.FSm, FV=BASE.FV, FS=BASE.FS, MX=0.0, MY=0.0,
         reversal_velocity=BASE.motor_reversal, load_reversal_velocity=BASE.load_reversal,
     )  # fmt: skip
-    effects = [EffectValues("hardening_stiffness", {"cubic_stiffness": CUBIC})]
-    torque = simulate_motor_driven(axis, motor, RATE, effects=effects).torque
+    torque = simulate_motor_driven(axis, motor, RATE, effects=[hidden]).torque
     segment = Segment(
         0.0,
         torque + NOISE.torque * rng.standard_normal(SAMPLES),
@@ -112,6 +112,25 @@ def test_its_columns_are_derivatives_about_the_solution():
 def test_another_record_is_predicted_by_simulation_down_to_its_noise():
     fitter, _, found = fits()
     assert rms(predicted(problem(2), fitter, found)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_an_event_has_its_own_instant_in_another_record():
+    """With the first record's instant, a payload that changed earlier there leaves a multiple of the noise."""
+    payload, more = Form(effect("payload_change"), 0), 0.5
+
+    def changed(when: float) -> EffectValues:
+        return EffectValues("payload_change", {"inertia_change": more, "time_of_change": when})
+
+    fitter = Fitter([payload], (0.0,))
+    found = refined(fitter, fitter.fit(problem(1, hidden=changed(11.0)), [Chosen(payload, (10.9,))]))
+    assert found is not None
+    assert found.amplitudes(0)[0] == pytest.approx(more, rel=0.03)
+    other = problem(2, hidden=changed(6.3))
+    there = replace(found.point, starts=np.zeros(2))
+    held = residual(other.at(there.base), there)
+    assert held is not None
+    assert rms(held) > 2.0
+    assert rms(predicted(other, fitter, found)) == pytest.approx(1.0, abs=0.15)
 
 
 def test_no_simulation_follows_a_wrong_stiffness():
