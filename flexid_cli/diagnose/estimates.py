@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.fitter import REVERSALS, Fitted
-from flexid_cli.diagnose.problem import MODEL_FLOOR, RIGID_NAMES, SCALED, Problem, Stretch
+from flexid_cli.diagnose.problem import MODEL_FLOOR, RIGID_NAMES, SCALED, Problem
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.effects.base import unit_of
 from flexid_cli.estimate.covariance import RobustCovariance, robust_covariance
 from flexid_cli.estimate.result import Estimate

@@ -22,10 +22,11 @@ from flexid_cli.diagnose.estimates import (
 from flexid_cli.diagnose.estimates import METHOD as WHITENED
 from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter
 from flexid_cli.diagnose.location import residual_maps
-from flexid_cli.diagnose.problem import HALF_WIDTH, MARGIN, MOTOR_SIGN_BAND, Problem
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.rows import TAPER_S, Weights
 from flexid_cli.diagnose.search import Search
 from flexid_cli.diagnose.selection import threshold
+from flexid_cli.diagnose.stretch import HALF_WIDTH, MARGIN, MOTOR_SIGN_BAND
 from flexid_cli.effects.base import Effect, unit_of
 from flexid_cli.effects.registry import effects as library
 from flexid_cli.estimate.result import Estimate, Fit, ModelEffect, ModelResult, PipelineSummary, Trace

@@ -42,7 +42,5 @@ def own_instant(problem: Problem, event: Chosen, amplitudes: Array, left: Array)
     points = np.linspace(0.0, problem.duration_s, INSTANTS)
     best = int(np.argmin([cost(float(t)) for t in points]))
     near = tuple(points[max(best - 1, 0) : best + 2])
-    instant, _ = minimum(
-        cost, 0.0, problem.duration_s, near, 0.5 * problem.stretches[0].period_s, MOST_STEPS
-    )
+    instant, _ = minimum(cost, 0.0, problem.duration_s, near, 0.5 * problem.stretches[0].period_s, MOST_STEPS)
     return at(instant)

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from flexid_cli.diagnose.basis import Basis
 from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter
 from flexid_cli.diagnose.instants import own_instant
-from flexid_cli.diagnose.problem import ALONE_NAMES, MOTOR_SIGN_BAND, Problem, Stretch, later
+from flexid_cli.diagnose.problem import ALONE_NAMES, Problem
 from flexid_cli.diagnose.reversals import motor_sharpened
 from flexid_cli.diagnose.rows import Complex
+from flexid_cli.diagnose.stretch import MOTOR_SIGN_BAND, Stretch, later
 from flexid_cli.diagnose.trust import trusted
 from flexid_cli.effects.base import EffectValues, Stage
 from flexid_cli.effects.motion import Base, Motion

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from flexid_cli.diagnose.bands import correlated_rows, spread
 from flexid_cli.diagnose.basis import Basis
 from flexid_cli.diagnose.location import hats
-from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.result import LoopWidth
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.effects.motion import Motion, Terms
 
 Array = NDArray[np.float64]

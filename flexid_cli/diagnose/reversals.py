@@ -19,7 +19,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from flexid_cli.diagnose.mean_sign import FINE, FULL, between
-from flexid_cli.diagnose.problem import Effects, Problem, Stretch
+from flexid_cli.diagnose.problem import Effects, Problem
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.effects.motion import Motion
 from flexid_cli.estimate.driven import friction_sign
 from flexid_cli.signals.recording import Segment

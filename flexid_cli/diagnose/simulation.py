@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from flexid_cli.diagnose.problem import SMOOTH_BAND, Problem, Stretch
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.result import SimulationError
+from flexid_cli.diagnose.stretch import SMOOTH_BAND, Stretch
 from flexid_cli.effects.base import EffectValues
 from flexid_cli.errors import FlexidError
 

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from flexid_cli.diagnose.basis import solve
 from flexid_cli.diagnose.fitter import Chosen, Fitter, informed
-from flexid_cli.diagnose.problem import SHORTEST_S, SMOOTH_BAND, Problem, Stretch
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.reversals import motor_sharpened
 from flexid_cli.diagnose.rows import motor_only_noise, two_encoder_noise
+from flexid_cli.diagnose.stretch import SMOOTH_BAND, Stretch
 from flexid_cli.diagnose.torque_noise import ABOVE, HIGHEST, MOST_FALL, torque_noise
 from flexid_cli.diagnose.trust import trusted
 from flexid_cli.effects.forms import lagged
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 HIGHEST_BAND = 0.2  # of the sampling rate
+SHORTEST_S = 2.0
 FIRST_WIDTH = 0.004  # of the highest speed
 SCAN_POINTS, SCAN_STEPS = 14, 4
 SAME_MINIMUM = 0.25  # of the stiffness's logarithm

@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flexid_cli.diagnose.problem import SMOOTH_BAND, Effects, Problem, Stretch
+from flexid_cli.diagnose.problem import Effects, Problem
 from flexid_cli.diagnose.rows import Weights, motor_only_noise, two_encoder_noise
+from flexid_cli.diagnose.stretch import SMOOTH_BAND, Stretch
 from flexid_cli.effects.motion import Motion
 from flexid_cli.estimate.budget import NoiseLevels
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.search import Form
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.effects.base import EffectValues
 from flexid_cli.effects.motion import Base, Motion, Terms
 from flexid_cli.effects.registry import effect, effects

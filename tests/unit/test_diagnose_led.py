@@ -11,9 +11,10 @@ import pytest
 from flexid_cli.diagnose.evidence import predicted
 from flexid_cli.diagnose.fitter import Chosen, Fitted, Fitter
 from flexid_cli.diagnose.led import LedFit, Point, refined, residual
-from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.reversals import motor_sharpened
 from flexid_cli.diagnose.search import Form
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.effects.base import EffectValues
 from flexid_cli.effects.motion import Base
 from flexid_cli.effects.registry import effect

@@ -7,10 +7,11 @@ import pytest
 from scipy.fft import next_fast_len
 
 from flexid_cli.diagnose.basis import solve
-from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.rows import Taper, Weights
 from flexid_cli.diagnose.search import Form
 from flexid_cli.diagnose.start import _first_order
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.diagnose.torque_noise import MOST_FALL
 from flexid_cli.effects.motion import Base, Terms
 from flexid_cli.effects.registry import effect

@@ -11,8 +11,9 @@ import pytest
 from flexid_cli.diagnose import evidence
 from flexid_cli.diagnose.basis import Basis, solve
 from flexid_cli.diagnose.fitter import Chosen
-from flexid_cli.diagnose.problem import Joined, Problem, Stretch
+from flexid_cli.diagnose.problem import Joined, Problem
 from flexid_cli.diagnose.search import Candidate, Form, Search, gained, minimum
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.effects.forms import LEAST_PERIODS, lagged
 from flexid_cli.effects.motion import Base, Motion, Terms
 from flexid_cli.effects.registry import effect, effects

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flexid_cli.diagnose.problem import Stretch
 from flexid_cli.diagnose.start import _first_base
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.errors import DataError
 from flexid_cli.signals.recording import Segment
 

@@ -18,9 +18,10 @@ from flexid_cli.diagnose.drift import drifts
 from flexid_cli.diagnose.events import events
 from flexid_cli.diagnose.location import located, residual_maps
 from flexid_cli.diagnose.loop_width import log_slope, loop_width
-from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.result import Locality, Shape, Where
 from flexid_cli.diagnose.reversal_windows import reversals, turns
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.diagnose.suggest import interval, suggestions
 from flexid_cli.effects.motion import Base
 from flexid_cli.estimate.bootstrap import block_spread

@@ -11,8 +11,9 @@ import pytest
 from flexid_cli.diagnose import selection
 from flexid_cli.diagnose.fitter import Fitter as RecordFitter
 from flexid_cli.diagnose.led import LedFit
-from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.problem import Problem
 from flexid_cli.diagnose.search import Form
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.effects.base import EffectValues
 from flexid_cli.effects.motion import Base
 from flexid_cli.effects.registry import effect

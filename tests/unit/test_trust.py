@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexid_cli.diagnose.problem import Problem, Stretch
+from flexid_cli.diagnose.problem import Problem
+from flexid_cli.diagnose.stretch import Stretch
 from flexid_cli.diagnose.trust import trusted
 from flexid_cli.effects.motion import Base
 from flexid_cli.estimate.budget import NoiseLevels
