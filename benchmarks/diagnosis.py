@@ -54,7 +54,18 @@ sys.path[:] = [str(ROOT), *(p for p in sys.path if Path(p or ".").resolve() != R
 import numpy as np  # noqa: E402
 import yaml  # noqa: E402
 
-from benchmarks.machine.cases import LISTS, NONE, Case, CaseError, Task, columns, configuration, make, tasks  # noqa: E402
+from benchmarks.machine.cases import (  # noqa: E402
+    FIRST_SEED,
+    LISTS,
+    NONE,
+    Case,
+    CaseError,
+    Task,
+    columns,
+    configuration,
+    make,
+    tasks,
+)
 from benchmarks.machine.effects import DROPPED_FRICTION  # noqa: E402
 
 TOOL = "flexid_cli.diagnose.diagnose:diagnose"
@@ -636,7 +647,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     made.add_argument("--list", action="append", choices=LISTS, help="which cases; repeatable (default: all)")
     made.add_argument("--limit", type=int, help="only so many cases of each list, a fair sample")
-    made.add_argument("--seeds", choices=("calibration", "test"), default="test")
+    made.add_argument("--seeds", choices=tuple(FIRST_SEED), default="test")
     made.add_argument("--jobs", type=int, default=1, help="processes")
     made.add_argument("--results", type=Path, help="JSON lines (default: out/diagnosis-SEEDS.jsonl)")
     made.add_argument(
