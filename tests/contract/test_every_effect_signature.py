@@ -52,6 +52,7 @@ SMALL: dict[tuple[str, int], tuple[tuple[float, ...], tuple[float, ...]]] = {
     ("gravity", 0): ((), (0.2, -0.1)),
     ("stribeck_load", 0): ((0.3,), (0.3,)),
     ("second_mode", 0): ((25.0, 0.05), (0.1,)),
+    ("second_mode", 1): ((25.0, 0.05), (0.1,)),
     ("payload_change", 0): ((4.1,), (0.2,)),
     ("clock_skew", 0): ((), (3e-4,)),
     ("sensor_lag", 0): ((), (3e-4,)),

@@ -53,12 +53,23 @@ def _columns(m: Motion, shape: Sequence[float]) -> Terms:
 
 
 def _shapes(scale: Scale) -> Sequence[Shape]:
-    high = min(1.3 * scale.band_hz, 0.45 / scale.period_s)
     return (
         # A lightly damped mode between two frequencies is met by none of them unless the damping's points overlap.
-        Shape("frequency", 0.2 * scale.resonance_hz, high, 25),
+        Shape("frequency", 0.2 * scale.resonance_hz, _highest(scale), 25),
         Shape("damping_ratio", 0.01, 0.7, 4),
     )
+
+
+def _shapes_alone(scale: Scale) -> Sequence[Shape]:
+    """With the motor alone a mode that is damped strongly stands in for the transmission's damping."""
+    return (
+        Shape("frequency", 0.3 * scale.resonance_hz, _highest(scale), 22),
+        Shape("damping_ratio", 0.01, 0.3, 3),
+    )
+
+
+def _highest(scale: Scale) -> float:
+    return min(1.3 * scale.band_hz, 0.45 / scale.period_s)
 
 
 def _values(a: Array, shape: Sequence[float], _: Base) -> dict[str, float]:
@@ -93,5 +104,8 @@ EFFECT = Effect(
     text=__doc__,
     laws=(Law(Stage.LOAD, _torque),),
     states=(EffectState("position", "joint_position"), EffectState("velocity", "joint_velocity")),
-    signatures=(Signature(_columns, _values, _shapes, sign=1, tied=_tied),),
+    signatures=(
+        Signature(_columns, _values, _shapes, sign=1, tied=_tied, needs_joint=True),
+        Signature(_columns, _values, _shapes_alone, sign=1, tied=_tied, motor_alone=True),
+    ),
 )
