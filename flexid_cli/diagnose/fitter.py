@@ -27,6 +27,7 @@ NEAR = 0.03  # of the search's steps: an instant of change is told to a sample
 REVERSALS = {"motor_reversal": "FSm", "load_reversal": "FS"}  # widths of the base and their friction
 REVERSAL = 3.0  # widths about zero velocity that a reversal takes
 NARROWEST = 1e-5  # reversal width, rad/s or m/s
+WIDEST = 0.1  # of the highest speed: a wider one is a curve of the friction, and takes an effect's place
 SETTLED_STIFFNESS, SETTLING_STEPS = 1e-4, 6  # relative change of the stiffness
 # Gain of an effect whose richer form is tried, and what that needs beyond it.
 PROMISING, EXTENDED = 0.05, 0.02
@@ -257,7 +258,11 @@ class Fitter:
                 return float(e @ e)
 
             low, high = max(now - WIDTH_RANGE, np.log(NARROWEST)), now + WIDTH_RANGE
-            first = (max(now - WIDTH_STEP, low), now, now + WIDTH_STEP)
+            if problem.both:
+                scale = fitted.search.scale
+                speed = scale.motor_speed if symbol == "FSm" else scale.joint_speed
+                high = max(min(high, np.log(WIDEST * speed)), now)
+            first = (max(now - WIDTH_STEP, low), now, min(now + WIDTH_STEP, high))
             best, least = minimum(cost, low, high, first, WIDTH_NEAR, MOST_WIDTHS)
             if least < fitted.cost:
                 base = replace(base, **{field: float(np.exp(best))})
