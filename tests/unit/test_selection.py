@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flexid_cli.diagnose import selection
+from flexid_cli.diagnose.fitter import WIDEST
 from flexid_cli.diagnose.fitter import Fitter as RecordFitter
 from flexid_cli.diagnose.led import LedFit
 from flexid_cli.diagnose.problem import Problem
@@ -122,8 +123,8 @@ BASE = Base(
 NOISE = NoiseLevels(0.2, 1e-7, 1e-7)
 
 
-def test_a_flat_friction_is_found_although_a_wide_reversal_has_taken_its_place():
-    """The width that fits the reversal without the effect looks like a part of |v|^a: the effect's start is wrong."""
+def rubbing(power: float, exponent: float) -> Problem:
+    """A record of an axis whose motor has a friction beyond the baseline's, linearised at a start that is off."""
     rng, t = np.random.default_rng(5), np.arange(SAMPLES) / RATE
     waves = [
         0.3 / (1.0 + f) * np.sin(2.0 * np.pi * (f * t + rng.random())) for f in (0.2, 0.5, 1.3, 3.1, 7.0)
@@ -132,7 +133,7 @@ def test_a_flat_friction_is_found_although_a_wide_reversal_has_taken_its_place()
         Jm=BASE.Jm, K=BASE.K, JL=BASE.JL, FVm=BASE.FVm, FSm=BASE.FSm, FV=BASE.FV, FS=BASE.FS, MX=0.0, MY=0.0,
         reversal_velocity=BASE.motor_reversal, load_reversal_velocity=BASE.load_reversal,
     )  # fmt: skip
-    hidden = EffectValues("viscous_nonlinear", {"power_friction": 12.0, "power_exponent": 0.5})
+    hidden = EffectValues("viscous_nonlinear", {"power_friction": power, "power_exponent": exponent})
     controller = Controller(15.0, 150.0, 300.0)
     run = simulate_closed_loop(axis, controller, np.sum(waves, axis=0), RATE, effects=[hidden])
     segment = Segment(
@@ -142,18 +143,37 @@ def test_a_flat_friction_is_found_although_a_wide_reversal_has_taken_its_place()
         run.joint_position + NOISE.joint_position * rng.standard_normal(SAMPLES),
     )
     start = replace(BASE, FVm=20.0, FSm=6.0, motor_reversal=0.02)
-    problem = Problem(
+    return Problem(
         [Stretch(segment, RATE, BAND)], start, NOISE, BAND, gravity=9.81, gear_ratio=1.0, duration_s=SAMPLES / RATE,
         both=True, shift=0.5,
     )  # fmt: skip
-    forms = [
-        Form(effect(n), k)
-        for n in ("viscous_nonlinear", "stribeck_motor")
-        for k in range(len(effect(n).signatures))
-    ]
-    found = selection.select(RecordFitter(forms, (0.5,)), [problem]).after
+
+
+FRICTIONS = [
+    Form(effect(n), k)
+    for n in ("viscous_nonlinear", "stribeck_motor")
+    for k in range(len(effect(n).signatures))
+]
+
+
+def test_a_flat_friction_is_found_although_a_wide_reversal_has_taken_its_place():
+    """The width that fits the reversal without the effect looks like a part of |v|^a: the effect's start is wrong."""
+    found = selection.select(RecordFitter(FRICTIONS, (0.5,)), [rubbing(12.0, 0.5)]).after
     assert [c.name for c in found.chosen] == ["viscous_nonlinear"]
     assert found.chosen[0].shape[0] == pytest.approx(0.5, abs=0.1)
+    assert found.basis.rms < 1.3
+
+
+def test_a_reversal_does_not_become_a_curve_of_the_friction():
+    """A sign that turns over twice the highest speed is a cubic friction, and hides the one that was left out."""
+    problem = rubbing(5.0, 3.0)
+    most = WIDEST * problem.scale().motor_speed
+    fitter = RecordFitter(FRICTIONS, (0.5,))
+    baseline = fitter.relax(problem)
+    assert baseline.problem.base.motor_reversal <= 1.001 * most
+    found = selection.select(fitter, [problem]).after
+    assert [c.name for c in found.chosen] == ["viscous_nonlinear"]
+    assert found.chosen[0].shape[0] == pytest.approx(3.0, abs=0.1)
     assert found.basis.rms < 1.3
 
 
