@@ -27,7 +27,9 @@ NEAR = 0.03  # of the search's steps: an instant of change is told to a sample
 REVERSALS = {"motor_reversal": "FSm", "load_reversal": "FS"}  # widths of the base and their friction
 REVERSAL = 3.0  # widths about zero velocity that a reversal takes
 NARROWEST = 1e-5  # reversal width, rad/s or m/s
-WIDEST = 0.1  # of the highest speed: a wider one is a curve of the friction, and takes an effect's place
+# Of the highest speed (both encoders): such a sign has turned within a fifth of the speeds, tanh(2) = 0.96. A wider
+# one is a curve of the friction, and takes an effect's place.
+WIDEST = 0.1
 SETTLED_STIFFNESS, SETTLING_STEPS = 1e-4, 6  # relative change of the stiffness
 # Gain of an effect whose richer form is tried, and what that needs beyond it.
 PROMISING, EXTENDED = 0.05, 0.02
@@ -257,16 +259,22 @@ class Fitter:
                 e = fitted.basis.outside(fitted.y - friction * change)
                 return float(e @ e)
 
-            low, high = max(now - WIDTH_RANGE, np.log(NARROWEST)), now + WIDTH_RANGE
-            if problem.both:
-                scale = fitted.search.scale
-                speed = scale.motor_speed if symbol == "FSm" else scale.joint_speed
-                high = max(min(high, np.log(WIDEST * speed)), now)
+            low = max(now - WIDTH_RANGE, np.log(NARROWEST))
+            high = max(min(now + WIDTH_RANGE, self._widest(fitted, symbol)), now)
             first = (max(now - WIDTH_STEP, low), now, min(now + WIDTH_STEP, high))
             best, least = minimum(cost, low, high, first, WIDTH_NEAR, MOST_WIDTHS)
             if least < fitted.cost:
                 base = replace(base, **{field: float(np.exp(best))})
         return base
+
+    @staticmethod
+    def _widest(fitted: Fitted, symbol: str) -> float:
+        """Logarithm of the widest reversal of the motor or the load."""
+        if not fitted.problem.both:
+            return np.inf
+        scale = fitted.search.scale
+        speed = scale.motor_speed if symbol == "FSm" else scale.joint_speed
+        return float(np.log(max(WIDEST * speed, NARROWEST)))
 
     def _shift(self, fitted: Fitted) -> float:
         if len(self.shifts) == 1:

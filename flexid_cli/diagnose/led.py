@@ -318,28 +318,27 @@ def predicted(problem: Problem, fitted: LedFit) -> Array | None:
     motion that the torque shows does not: of the two the one that leaves less.
     """
     here = problem.at(fitted.problem.base, shift=fitted.problem.shift)
-    point = replace(fitted.point, starts=starts(here))
-    if any(c.form.signature.event for c in point.chosen):
-        point, _ = _shown(here, point)
+    point = _with_own_instants(here, replace(fitted.point, starts=starts(here)))
     here = _informed(here, fitted, point)
     simulated = _started(here, point)
     if simulated is None:
         return None
-    return min(simulated, _shown(here, point)[1], key=lambda e: float(e @ e))
+    shown = (_unexplained(here.at(point.base, led=led), point) for led in (False, True))
+    return min((simulated, *shown), key=lambda e: float(e @ e))
 
 
-def _shown(problem: Problem, point: Point) -> tuple[Point, Array]:
-    """What a point leaves of eq. (18) with the joint's motion that the record shows, and its events there."""
-    found = []
-    for led in (False, True):
-        here, own = problem.at(point.base, led=led), point
-        for k, c in enumerate(point.chosen):
-            if c.form.signature.event:
-                a = own.amplitudes[k]
-                left = _unexplained(here, own) + here.effect_rows(own.chosen[k].terms)[0] @ a
-                own = own.with_chosen(k, own_instant(here, c, a, left))
-        found.append((own, _unexplained(here, own)))
-    return min(found, key=lambda f: float(f[1] @ f[1]))
+def _with_own_instants(problem: Problem, point: Point) -> Point:
+    """The model with the events where the joint's motion that another record shows has them."""
+    for k, c in enumerate(point.chosen):
+        if c.form.signature.event:
+            moved = []
+            for led in (False, True):
+                here = problem.at(point.base, led=led)
+                left = _unexplained(here, point) + here.effect_rows(c.terms)[0] @ point.amplitudes[k]
+                other = point.with_chosen(k, own_instant(here, c, point.amplitudes[k], left))
+                moved.append((float(np.sum(_unexplained(here, other) ** 2)), other))
+            _, point = min(moved, key=lambda m: m[0])
+    return point
 
 
 def _started(problem: Problem, point: Point) -> Array | None:

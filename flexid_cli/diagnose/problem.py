@@ -519,9 +519,11 @@ class Problem:
     @cached_property
     def _torsion(self) -> Array:
         """Rows of a spring of unit stiffness, shape (r,)."""
-        return self._rows(lambda s, m: self._place_both(s, m, Terms(transmission=m.deflection[:, None])))[
-            :, 0
-        ]
+
+        def part(s: Stretch, m: Motion) -> list[Complex | None]:
+            return self._place_both(s, m, Terms(transmission=m.deflection[:, None]))
+
+        return self._rows(part)[:, 0]
 
     def place(self, s: Stretch, m: Motion, t: Terms) -> list[Complex | None]:
         """Spectra of what an effect adds to each equation."""
